@@ -1,0 +1,1 @@
+"""Track objects and build mosaics from video."""

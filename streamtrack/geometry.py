@@ -1,0 +1,139 @@
+"""Pure functions on points, quads and 3x3 matrices."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from streamtrack.types import Image, Matrix, Points, Size
+
+
+def transform_points(b_from_a: Matrix, points: npt.ArrayLike) -> Points:
+    """Map points (N, 2) of a into b, float32 (N, 2).
+
+    Points on the horizon of the mapping come out as inf or NaN; `is_sane_quad` catches them.
+    """
+    pts = np.asarray(points, np.float64).reshape(-1, 2)
+    mapped = pts @ b_from_a[:, :2].T + b_from_a[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        result: Points = (mapped[:, :2] / mapped[:, 2:]).astype(np.float32)
+    return result
+
+
+def projective_depths(b_from_a: Matrix, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Third homogeneous coordinate (N,) of the mapped points: one sign means no fold-over."""
+    pts = np.asarray(points, np.float64).reshape(-1, 2)
+    depths: npt.NDArray[np.float64] = pts @ b_from_a[2, :2] + b_from_a[2, 2]
+    return depths
+
+
+def normalized(matrix: Matrix) -> Matrix:
+    """The same mapping, scaled so that its last element is 1."""
+    scaled: Matrix = np.asarray(matrix, np.float64) / matrix[2, 2]
+    return scaled
+
+
+def inverted(b_from_a: Matrix) -> Matrix:
+    """a_from_b, scaled so that its last element is 1. Raises LinAlgError if singular."""
+    return normalized(np.linalg.inv(np.asarray(b_from_a, np.float64)))
+
+
+def translation(x: float, y: float) -> Matrix:
+    """The matrix that moves points by (x, y)."""
+    return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
+
+
+def scaling(factor_x: float, factor_y: float | None = None) -> Matrix:
+    """The matrix that resizes a picture, keeping pixel *edges* together.
+
+    Pixel centres sit at integers, so p' = (p + 0.5) * factor - 0.5, as `cv2.resize` does.
+    """
+    fy = factor_x if factor_y is None else factor_y
+    return np.array(
+        [
+            [factor_x, 0.0, 0.5 * factor_x - 0.5],
+            [0.0, fy, 0.5 * fy - 0.5],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def box_quad(x: float, y: float, width: float, height: float) -> Points:
+    """Quad (4, 2) of a box whose top-left corner is (x, y)."""
+    return np.array([[x, y], [x + width, y], [x + width, y + height], [x, y + height]], np.float32)
+
+
+def image_quad(size_wh: Size) -> Points:
+    """Centres of the four corner pixels of a picture, as a quad (4, 2)."""
+    return box_quad(0, 0, size_wh[0] - 1, size_wh[1] - 1)
+
+
+def signed_area(quad: npt.ArrayLike) -> float:
+    """Area of a polygon (N, 2) in px^2; positive when clockwise on the screen (y down)."""
+    x, y = np.asarray(quad, np.float64).reshape(-1, 2).T
+    return float(0.5 * (np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))))
+
+
+def is_convex(quad: npt.ArrayLike) -> bool:
+    """True if the polygon (N, 2) is strictly convex, whichever way round."""
+    pts = np.asarray(quad, np.float64).reshape(-1, 2)
+    edges = np.roll(pts, -1, axis=0) - pts
+    following = np.roll(edges, -1, axis=0)
+    turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
+    return bool(np.all(turns > 0) or np.all(turns < 0))
+
+
+def bounding_box(points: npt.ArrayLike) -> tuple[float, float, float, float]:
+    """(x0, y0, x1, y1) of points (N, 2)."""
+    pts = np.asarray(points, np.float64).reshape(-1, 2)
+    x0, y0 = pts.min(axis=0)
+    x1, y1 = pts.max(axis=0)
+    return float(x0), float(y0), float(x1), float(y1)
+
+
+def clipped_quad_area(quad: npt.ArrayLike, size_wh: Size) -> float:
+    """Area in px^2 of the part of a convex polygon that lies inside a picture.
+
+    Sutherland-Hodgman clipping against the picture's outer pixel edges.
+    """
+    polygon = np.asarray(quad, np.float64).reshape(-1, 2)
+    for axis, bound, sign in (
+        (0, -0.5, 1.0),
+        (0, size_wh[0] - 0.5, -1.0),
+        (1, -0.5, 1.0),
+        (1, size_wh[1] - 0.5, -1.0),
+    ):
+        polygon = _clip_half_plane(polygon, sign * (polygon[:, axis] - bound))
+        if len(polygon) < 3:
+            return 0.0
+    return abs(signed_area(polygon))
+
+
+def _clip_half_plane(
+    polygon: npt.NDArray[np.float64], inside: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    kept: list[npt.NDArray[np.float64]] = []
+    for i in range(len(polygon)):
+        j = (i + 1) % len(polygon)
+        if inside[i] >= 0:
+            kept.append(polygon[i])
+        if (inside[i] >= 0) != (inside[j] >= 0):
+            t = inside[i] / (inside[i] - inside[j])
+            kept.append(polygon[i] + t * (polygon[j] - polygon[i]))
+    return np.array(kept).reshape(-1, 2)
+
+
+def visible_share(quad: npt.ArrayLike, size_wh: Size) -> float:
+    """Share (0..1) of a convex quad's area that lies inside a picture."""
+    area = abs(signed_area(quad))
+    return clipped_quad_area(quad, size_wh) / area if area > 0 else 0.0
+
+
+def grey_of(image: Image) -> Image:
+    """The picture as (H, W) grey."""
+    import cv2
+
+    if image.ndim == 2:
+        return image
+    grey: Image = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+    return grey

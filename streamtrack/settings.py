@@ -1,0 +1,130 @@
+"""Settings of every stage; command-line flags and a TOML file build the same objects.
+
+Unknown names are refused. All settings are frozen: a run has one set from start to end.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Literal, TypeAlias, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from streamtrack.errors import UsageError, unknown_name
+
+Detector: TypeAlias = Literal["harris", "fast", "agast", "gftt", "brisk", "orb", "sift", "akaze"]
+Descriptor: TypeAlias = Literal["freak", "brisk", "orb", "teblid", "sift", "akaze"]
+Method: TypeAlias = Literal["hybrid", "detect"]
+ModelChoice: TypeAlias = Literal["auto", "homography", "affine", "similarity", "translation"]
+CameraMode: TypeAlias = Literal["fixed", "moving"]
+
+DETECTORS: tuple[str, ...] = get_args(Detector)
+DESCRIPTORS: tuple[str, ...] = get_args(Descriptor)
+METHODS: tuple[str, ...] = get_args(Method)
+MODELS: tuple[str, ...] = get_args(ModelChoice)
+CAMERA_MODES: tuple[str, ...] = get_args(CameraMode)
+
+
+class VideoMode(StrEnum):
+    """How the picture gets into a recording."""
+
+    AUTO = "auto"
+    """Copy the source's packets or embed its file where that works, else JPEG."""
+    JPEG = "jpeg"
+    AV1 = "av1"
+    NONE = "none"
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class FeatureSettings(_Section):
+    """Detection and description of keypoints."""
+
+    detector: Detector = "harris"
+    threshold: float | None = Field(
+        default=None, description="detector's own threshold; None = default"
+    )
+    descriptor: Descriptor = "freak"
+    max_features: int = Field(default=1000, ge=8, le=100_000)
+
+
+class MatchingSettings(_Section):
+    """Matching of descriptors."""
+
+    max_ratio: float = Field(default=0.8, gt=0, le=1, description="best over second-best distance")
+
+
+class RegistrationSettings(_Section):
+    """Robust estimate and its gate."""
+
+    model: ModelChoice = "auto"
+    inlier_threshold_px: float = Field(default=3.0, gt=0)
+    min_inliers: int = Field(default=10, ge=4)
+    seed: int = 1
+
+
+class TrackerSettings(_Section):
+    """Following of targets."""
+
+    method: Method = "hybrid"
+
+
+class RecordingSettings(_Section):
+    """Recording for the Rerun viewer."""
+
+    video: VideoMode = VideoMode.AUTO
+    jpeg_quality: int = Field(default=80, ge=1, le=100)
+    max_asset_mb: float = Field(
+        default=200.0, gt=0, description="largest file that is embedded whole"
+    )
+
+
+class Settings(_Section):
+    """All of them."""
+
+    features: FeatureSettings = FeatureSettings()
+    matching: MatchingSettings = MatchingSettings()
+    registration: RegistrationSettings = RegistrationSettings()
+    tracker: TrackerSettings = TrackerSettings()
+    camera: CameraMode = "fixed"
+    recording: RecordingSettings = RecordingSettings()
+
+
+_NAMES = {
+    "detector": DETECTORS,
+    "descriptor": DESCRIPTORS,
+    "method": METHODS,
+    "model": MODELS,
+    "camera": CAMERA_MODES,
+    "video": tuple(VideoMode),
+}
+
+
+def build_settings(values: dict[str, Any]) -> Settings:
+    """Settings from nested plain values, as a TOML file holds them.
+
+    Raises UsageError, in one line, for unknown names and values out of range.
+    """
+    try:
+        return Settings.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        last = str(first["loc"][-1])
+        if first["type"] in ("literal_error", "enum") and last in _NAMES:
+            raise unknown_name(last, str(first["input"]), _NAMES[last]) from None
+        if first["type"] == "extra_forbidden":
+            raise UsageError(f"unknown setting '{place}': see README, 'Settings'") from None
+        raise UsageError(f"setting {place} = {first['input']!r}: {first['msg']}") from None
+
+
+def read_settings_file(path: Path) -> dict[str, Any]:
+    """Nested values of a TOML settings file. Raises UsageError if it cannot be read."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise UsageError(f"settings file {path}: {error}") from None

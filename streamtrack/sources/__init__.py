@@ -1,0 +1,1 @@
+"""Sources of frames: `open_source` opens any of them."""

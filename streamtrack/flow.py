@@ -1,0 +1,231 @@
+"""Alignment by pre-warped dense flow: the frame is warped back into the template, then matched.
+
+The idea of WOFT (Serych & Matas 2023): after warping the frame by the predicted pose, the target
+looks nearly as in its first frame, so a small flow remains, and as it is measured against the
+first frame every time, no drift accumulates. The flow is DIS (Kroeger et al. 2016), here without
+its variational refinement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from streamtrack import geometry
+from streamtrack.registration import refused, register
+from streamtrack.settings import RegistrationSettings
+from streamtrack.template import Patch, Template
+from streamtrack.types import Image, Mask, Matrix, Points, Registration, Verdict
+from streamtrack.view import FrameView, level_from_frame
+
+Floats = npt.NDArray[np.float32]
+
+_MIN_CORRELATION = 0.5
+_MIN_SUPPORTED_SHARE = 0.2
+_MIN_VISIBLE_POINTS = 10
+_CORRELATION_WINDOW = 11
+_NOISE_VARIANCE = 9.0
+_SEARCH_PX = 12.0
+_COARSE_STEPS = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """Where the template's textured points were found in a frame, and the pose they give.
+
+    template_points, frame_points  float32 (N, 2) of those whose surroundings are in view
+    registration                   frame_from_template with its verdict
+    correlation                    mean local correlation of the points that support the pose
+    """
+
+    registration: Registration
+    template_points: Points
+    frame_points: Points
+    correlation: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Warp:
+    """The frame seen through a pose as the patch would see it."""
+
+    image: Image
+    frame_from_patch: Matrix
+    frame_px: float
+    visible: Mask
+
+
+class FlowAligner:
+    """Aligns one template; keeps DIS's buffers from frame to frame, nothing else."""
+
+    def __init__(self, template: Template, settings: RegistrationSettings) -> None:
+        self._template = template
+        self._settings = settings
+        self._coarse_flow = _make_flow(finest_scale=1)
+        self._fine_flow = _make_flow(finest_scale=0)
+
+    def align(self, view: FrameView, guess: Matrix) -> Alignment:
+        """The pose near ``guess`` (frame_from_template): first coarse, then fine."""
+        template = self._template
+        fine = patch_for(template, guess)
+        coarse = min(fine + _COARSE_STEPS, len(template.patches) - 1)
+        pose = guess
+        if coarse > fine:
+            rough = self._flow_step(
+                view, template.patches[coarse], pose, self._coarse_flow, "affine"
+            )
+            if rough.registration.b_from_a is None:
+                return rough
+            pose = rough.registration.b_from_a
+        return self._flow_step(
+            view, template.patches[fine], pose, self._fine_flow, self._settings.model
+        )
+
+    def _flow_step(
+        self, view: FrameView, patch: Patch, pose: Matrix, flow: cv2.DISOpticalFlow, model: str
+    ) -> Alignment:
+        warp = _warp_back(view, patch, pose)
+        visible = warp.visible
+        template_points = patch.template_points[visible]
+        if np.count_nonzero(visible) < _MIN_VISIBLE_POINTS:
+            return _refusal(Verdict.OUT_OF_VIEW, template_points)
+        image = _matched_in_grey(warp.image, patch, visible)
+        field = np.asarray(flow.calc(patch.image, image, None), np.float32)
+        columns, rows = patch.points[visible].astype(np.intp).T
+        moved = patch.points[visible] + field[rows, columns]
+        frame_points = geometry.transform_points(warp.frame_from_patch, moved)
+        correlation = _local_correlation(patch.image, _warped_by(image, field))[rows, columns]
+        is_like = correlation >= _MIN_CORRELATION
+        registration = self._estimate(template_points, frame_points, is_like, warp.frame_px, model)
+        supported = registration.is_inlier
+        share = np.count_nonzero(supported) / len(supported)
+        mean = float(correlation[supported].mean()) if supported.any() else float("nan")
+        if registration.verdict is Verdict.OK and share < _MIN_SUPPORTED_SHARE:
+            registration = refused(Verdict.LOW_CORRELATION, len(supported), supported)
+        return Alignment(registration, template_points, frame_points, mean)
+
+    def _estimate(
+        self,
+        template_points: Points,
+        frame_points: Points,
+        is_like: Mask,
+        frame_px: float,
+        model: str,
+    ) -> Registration:
+        settings = self._settings.model_copy(
+            update={"inlier_threshold_px": 1.5 * frame_px, "model": model}
+        )
+        area = (2 * _SEARCH_PX * frame_px) ** 2
+        found = register(
+            template_points[is_like], frame_points[is_like], settings, self._template.quad, area
+        )
+        is_inlier = np.zeros(len(template_points), np.bool_)
+        is_inlier[np.flatnonzero(is_like)[found.is_inlier]] = True
+        return Registration(found.verdict, found.b_from_a, found.model, is_inlier, found.rmse_px)
+
+
+def patch_for(template: Template, frame_from_template: Matrix) -> int:
+    """Index of the patch whose resolution fits the target's size in the frame."""
+    magnification = local_scale(frame_from_template, template.quad.mean(axis=0))
+    for i, patch in enumerate(template.patches):
+        if patch.scale <= 1.2 * magnification:
+            return i
+    return len(template.patches) - 1
+
+
+def local_scale(b_from_a: Matrix, point: npt.NDArray[np.generic]) -> float:
+    """Pixels of b per pixel of a at a point of a: root of the Jacobian's determinant."""
+    depth = float(b_from_a[2, 0] * point[0] + b_from_a[2, 1] * point[1] + b_from_a[2, 2])
+    return float(np.sqrt(abs(np.linalg.det(b_from_a) / depth**3)))
+
+
+def _make_flow(finest_scale: int) -> cv2.DISOpticalFlow:
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    flow.setFinestScale(finest_scale)
+    flow.setPatchSize(8)
+    flow.setPatchStride(4)
+    flow.setGradientDescentIterations(16)
+    flow.setVariationalRefinementIterations(0)
+    return flow
+
+
+def _warp_back(view: FrameView, patch: Patch, pose: Matrix) -> _Warp:
+    height, width = patch.image.shape
+    frame_from_patch = pose @ geometry.inverted(patch.patch_from_template)
+    centre = np.array([width / 2, height / 2])
+    frame_px = local_scale(frame_from_patch, centre)
+    octave = max(0, min(5, round(np.log2(max(frame_px, 1e-3)))))
+    level_from_patch = level_from_frame(view, octave) @ frame_from_patch
+    image = cv2.warpPerspective(
+        view.level(octave),
+        level_from_patch,
+        (width, height),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    in_frame = geometry.transform_points(frame_from_patch, patch.points)
+    frame_width, frame_height = view.size_wh
+    reach = 3 * frame_px
+    visible = (
+        (in_frame[:, 0] >= reach)
+        & (in_frame[:, 1] >= reach)
+        & (in_frame[:, 0] < frame_width - reach)
+        & (in_frame[:, 1] < frame_height - reach)
+    )
+    return _Warp(np.asarray(image, np.uint8), frame_from_patch, frame_px, visible)
+
+
+def _matched_in_grey(image: Image, patch: Patch, visible: Mask) -> Image:
+    """The warped frame with its contrast and brightness brought to the patch's.
+
+    Fitted robustly (median and quartiles) at the visible points, so that an occluder of less
+    than half the target does not set them. DIS itself removes the mean of each small block.
+    """
+    columns, rows = patch.points[visible].astype(np.intp).T
+    ours, theirs = patch.image[rows, columns], image[rows, columns]
+    low_p, mid_p, high_p = np.percentile(ours, (20, 50, 80))
+    low_w, mid_w, high_w = np.percentile(theirs, (20, 50, 80))
+    gain = float(np.clip((high_p - low_p + 2) / (high_w - low_w + 2), 0.3, 4.0))
+    adjusted = cv2.convertScaleAbs(image, alpha=gain, beta=float(mid_p - gain * mid_w))
+    return np.asarray(adjusted, np.uint8)
+
+
+def _warped_by(image: Image, field: Floats) -> Image:
+    """``image`` sampled at each pixel's place plus its flow (h, w, 2)."""
+    height, width = image.shape
+    columns, rows = np.meshgrid(
+        np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)
+    )
+    warped = cv2.remap(
+        image,
+        columns + field[..., 0],
+        rows + field[..., 1],
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return np.asarray(warped, np.uint8)
+
+
+def _local_correlation(a: Image, b: Image) -> Floats:
+    """Normalised cross-correlation of the windows around each pixel, (h, w) in -1..1.
+
+    The variance of plain noise is added to the denominator, so flat windows score zero.
+    """
+    window = (_CORRELATION_WINDOW, _CORRELATION_WINDOW)
+    fa, fb = a.astype(np.float32), b.astype(np.float32)
+
+    def mean(values: Floats) -> Floats:
+        return np.asarray(cv2.boxFilter(values, -1, window), np.float32)
+
+    mean_a, mean_b = mean(fa), mean(fb)
+    covariance = mean(fa * fb) - mean_a * mean_b
+    variance_a = mean(fa * fa) - mean_a * mean_a + _NOISE_VARIANCE
+    variance_b = mean(fb * fb) - mean_b * mean_b + _NOISE_VARIANCE
+    return np.asarray(covariance / np.sqrt(variance_a * variance_b), np.float32)
+
+
+def _refusal(verdict: Verdict, template_points: Points) -> Alignment:
+    unknown = np.full_like(template_points, np.nan)
+    return Alignment(refused(verdict, len(template_points)), template_points, unknown, float("nan"))

@@ -1,0 +1,93 @@
+"""The loop: one frame in, one `Step` out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from itertools import islice
+
+from streamtrack import geometry
+from streamtrack.camera import make_camera
+from streamtrack.errors import UsageError
+from streamtrack.features import FeatureExtractor
+from streamtrack.settings import Settings
+from streamtrack.sources.base import FrameSource
+from streamtrack.targets import Target, check_quad_in_picture
+from streamtrack.template import make_template, picture_quad
+from streamtrack.tracker import DetectTracker, HybridTracker, TargetTracker
+from streamtrack.types import Step, Track
+from streamtrack.view import FrameView
+
+
+def track(
+    source: FrameSource,
+    targets: Sequence[Target],
+    settings: Settings | None = None,
+    *,
+    start: int = 0,
+    step: int = 1,
+    frames: int | None = None,
+) -> Iterator[Step]:
+    """Follow targets through a source, one `Step` a frame.
+
+    Quads are in pixels of the first frame that is used: frame ``start`` of the source, then every
+    ``step``-th, ``frames`` of them at most. Raises TargetError if a target cannot be tracked in
+    that frame, SourceError when the source breaks or has no frame ``start``.
+    """
+    settings = settings or Settings()
+    extractor = FeatureExtractor(settings.features)
+    trackers: list[TargetTracker] = []
+    camera = make_camera(settings)
+    stop = None if frames is None else start + frames * step
+    is_first = True
+    for frame in islice(source, start, stop, step):
+        began = time.perf_counter()
+        view = FrameView(frame, extractor)
+        if is_first:
+            trackers = [make_tracker(target, view, extractor, settings) for target in targets]
+            is_first = False
+        tracks, track_ms = _follow_all(trackers, view)
+        camera_began = time.perf_counter()
+        pose = camera.update(view, tracks)
+        ended = time.perf_counter()
+        stage_ms = {
+            **track_ms,
+            "detect": view.detect_ms,
+            "camera": (ended - camera_began) * 1e3,
+            "total": (ended - began) * 1e3,
+        }
+        yield Step(frame, tracks, pose, view.detected, stage_ms)
+    if is_first and start > 0:
+        raise UsageError(f"the source has no frame {start}: it ended before")
+
+
+def _follow_all(
+    trackers: Sequence[TargetTracker], view: FrameView
+) -> tuple[tuple[Track, ...], dict[str, float]]:
+    """Every target in the frame, and the milliseconds it took by the way it was found."""
+    tracks, track_ms = [], {"flow": 0.0, "match": 0.0}
+    for tracker in trackers:
+        began = time.perf_counter()
+        detect_before = view.detect_ms
+        tracks.append(tracker.update(view))
+        spent_ms = (time.perf_counter() - began) * 1e3 - (view.detect_ms - detect_before)
+        track_ms["flow" if tracks[-1].means == "flow" else "match"] += spent_ms
+    return tuple(tracks), track_ms
+
+
+def make_tracker(
+    target: Target, view: FrameView, extractor: FeatureExtractor, settings: Settings
+) -> TargetTracker:
+    """The tracker of one target; ``view`` is the first frame, in which its quad lies."""
+    if target.quad is not None:
+        check_quad_in_picture(target.name, target.quad, view.size_wh)
+        template = make_template(target.name, view.frame.image, target.quad, extractor)
+        first_pose = geometry.translation(0, 0)
+    else:
+        assert target.picture is not None
+        quad = picture_quad(target.picture)
+        template = make_template(target.name, target.picture, quad, extractor)
+        first_pose = None
+    if settings.tracker.method == "detect":
+        return DetectTracker(template, settings)
+    return HybridTracker(template, settings, first_pose)

@@ -1,0 +1,379 @@
+"""From point pairs to a transformation that can be trusted, or a refusal with its reason.
+
+Four steps: a robust estimate (MAGSAC++, OpenCV's USAC with a fixed seed), a last weighted least
+squares over the inliers, the choice of the transformation model by an information criterion, and
+a gate. `cv2.findHomography` answers pure noise with a confident matrix or with None; both end
+here as a refusal.
+"""
+
+from __future__ import annotations
+
+from math import lgamma, log
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from streamtrack import geometry
+from streamtrack.settings import RegistrationSettings
+from streamtrack.types import Mask, Matrix, Model, Points, Registration, Verdict
+
+Doubles = npt.NDArray[np.float64]
+
+DEGREES_OF_FREEDOM = {
+    Model.TRANSLATION: 2,
+    Model.SIMILARITY: 4,
+    Model.AFFINE: 6,
+    Model.HOMOGRAPHY: 8,
+}
+_MAX_AREA_RATIO = 60.0
+_MAX_PERSPECTIVE_RATIO = 40.0
+_MIN_SPREAD_SHARE = 0.02
+_MAX_LOG10_FALSE_ALARMS = -4.0
+_ROBUST_ROUNDS = 3
+
+
+def register(
+    a: Points,
+    b: Points,
+    settings: RegistrationSettings,
+    region: Points,
+    candidate_area_px: float,
+) -> Registration:
+    """The gated mapping from picture a to picture b.
+
+    ``a`` and ``b`` (M, 2) are paired points. ``region`` (4, 2) is the quad in a that the mapping
+    is wanted for: the gate judges the mapping there. ``candidate_area_px`` is the area of b in
+    which a partner was looked for, which tells how easily pairs agree by chance.
+    """
+    if len(a) < max(4, settings.min_inliers):
+        return refused(Verdict.TOO_FEW_MATCHES, len(a))
+    is_inlier = robust_inliers(a, b, settings)
+    if np.count_nonzero(is_inlier) < settings.min_inliers:
+        return refused(Verdict.TOO_FEW_INLIERS, len(a), is_inlier)
+    model = choose_model(a[is_inlier], b[is_inlier], settings)
+    b_from_a, is_inlier = fit_to_inliers(model, a, b, is_inlier, settings.inlier_threshold_px)
+    inliers = int(np.count_nonzero(is_inlier))
+    verdict = _judge_support(a, is_inlier, settings, region, candidate_area_px)
+    if verdict is Verdict.OK:
+        verdict = judge_mapping(b_from_a, region)
+    if verdict is not Verdict.OK:
+        return refused(verdict, len(a), is_inlier)
+    errors = transfer_errors(b_from_a, a, b)
+    rmse_px = float(np.sqrt(np.mean(errors[is_inlier] ** 2))) if inliers else float("nan")
+    return Registration(Verdict.OK, b_from_a, model, is_inlier, rmse_px)
+
+
+def refused(verdict: Verdict, pairs: int, is_inlier: Mask | None = None) -> Registration:
+    """A registration that says why there is none."""
+    none = np.zeros(pairs, np.bool_) if is_inlier is None else is_inlier
+    return Registration(verdict, None, None, none, float("nan"))
+
+
+# -- robust estimate ----------------------------------------------------------------------------
+
+
+def robust_inliers(a: Points, b: Points, settings: RegistrationSettings) -> Mask:
+    """Which pairs (M,) agree with one homography or, of fewer freedoms, the model asked for.
+
+    MAGSAC++ (Barath et al. 2020) as in OpenCV's USAC, with the seed of the settings.
+    """
+    if settings.model in ("translation", "similarity", "affine"):
+        return _robust_affine_inliers(a, b, settings)
+    _, mask = cv2.findHomography(a, b, _usac(settings))
+    return _as_mask(mask, len(a))
+
+
+def _robust_affine_inliers(a: Points, b: Points, settings: RegistrationSettings) -> Mask:
+    _, mask = cv2.estimateAffine2D(a, b, _usac(settings))
+    return _as_mask(mask, len(a))
+
+
+def _usac(settings: RegistrationSettings) -> cv2.UsacParams:
+    params = cv2.UsacParams()
+    params.threshold = settings.inlier_threshold_px
+    params.randomGeneratorState = settings.seed
+    params.score = cv2.SCORE_METHOD_MAGSAC
+    params.sampler = cv2.SAMPLING_UNIFORM
+    params.loMethod = cv2.LOCAL_OPTIM_SIGMA
+    params.confidence = 0.999
+    params.maxIterations = 1000
+    params.isParallel = False
+    return params
+
+
+def _as_mask(mask: npt.NDArray[np.generic] | None, count: int) -> Mask:
+    # OpenCV's stubs say the mask is never None; it is when nothing agrees.
+    if mask is None:
+        return np.zeros(count, np.bool_)
+    is_inlier: Mask = np.asarray(mask).reshape(-1) > 0
+    return is_inlier
+
+
+# -- least squares ------------------------------------------------------------------------------
+
+
+def fit_to_inliers(
+    model: Model, a: Points, b: Points, is_inlier: Mask, threshold_px: float
+) -> tuple[Matrix, Mask]:
+    """Weighted least squares over the inliers, repeated with Tukey's biweight of the residuals.
+
+    Returns b_from_a and the pairs (M,) within ``threshold_px`` of it. The weights fall to zero
+    at 4.685 times the residuals' own scale (Huber & Ronchetti 2009), never beyond the threshold,
+    so that good pairs sharpen the result and doubtful ones do not blur it.
+    """
+    b_from_a = fit(model, a[is_inlier], b[is_inlier])
+    for _ in range(_ROBUST_ROUNDS):
+        weights = _biweights(transfer_errors(b_from_a, a, b), threshold_px)
+        if np.count_nonzero(weights) < DEGREES_OF_FREEDOM[model]:
+            break
+        if model is Model.HOMOGRAPHY:
+            used = weights > 0
+            b_from_a = gauss_newton_step(
+                b_from_a, a[used].astype(np.float64), b[used].astype(np.float64), weights[used]
+            )
+        else:
+            b_from_a = fit(model, a, b, weights)
+    return b_from_a, transfer_errors(b_from_a, a, b) < threshold_px
+
+
+def _biweights(errors: Doubles, threshold_px: float) -> Doubles:
+    """Tukey's biweight of each error (M,), its scale taken from the errors below the threshold."""
+    near = errors[errors < threshold_px]
+    if len(near) == 0:
+        return np.zeros(len(errors))
+    # The median length of a 2-D Gaussian error is 1.1774 times its standard deviation.
+    scale = float(np.median(near)) / 1.1774
+    cut = min(max(4.685 * scale, 0.25), threshold_px)
+    weights: Doubles = np.where(errors < cut, (1 - (errors / cut) ** 2) ** 2, 0.0)
+    return weights
+
+
+def fit(model: Model, a: Points, b: Points, weights: Doubles | None = None) -> Matrix:
+    """Weighted least-squares mapping of a model from pairs (M, 2); ``weights`` (M,)."""
+    w = np.ones(len(a)) if weights is None else np.asarray(weights, np.float64)
+    used = w > 0
+    pa, pb, w = a[used].astype(np.float64), b[used].astype(np.float64), w[used]
+    if model is Model.TRANSLATION:
+        return geometry.translation(*np.average(pb - pa, axis=0, weights=w))
+    if model is Model.SIMILARITY:
+        return _fit_similarity(pa, pb, w)
+    if model is Model.AFFINE:
+        return _fit_affine(pa, pb, w)
+    return gauss_newton_step(dlt_homography(pa, pb, w), pa, pb, w)
+
+
+def _fit_similarity(a: Doubles, b: Doubles, w: Doubles) -> Matrix:
+    """Scale, rotation and shift as one complex number each: b = s a + t."""
+    mean_a, mean_b = np.average(a, axis=0, weights=w), np.average(b, axis=0, weights=w)
+    za = (a - mean_a) @ np.array([1, 1j])
+    zb = (b - mean_b) @ np.array([1, 1j])
+    spread = float(np.sum(w * np.abs(za) ** 2))
+    s = complex(np.sum(w * np.conj(za) * zb)) / spread if spread > 0 else 1.0 + 0j
+    linear = np.array([[s.real, -s.imag], [s.imag, s.real]])
+    return _affine_matrix(linear, mean_b - linear @ mean_a)
+
+
+def _fit_affine(a: Doubles, b: Doubles, w: Doubles) -> Matrix:
+    mean_a, mean_b = np.average(a, axis=0, weights=w), np.average(b, axis=0, weights=w)
+    root = np.sqrt(w)[:, None]
+    solved: Doubles = np.linalg.lstsq(root * (a - mean_a), root * (b - mean_b), rcond=None)[0]
+    linear = np.asarray(solved.T, np.float64)
+    return _affine_matrix(linear, mean_b - linear @ mean_a)
+
+
+def _affine_matrix(linear: Doubles, shift: Doubles) -> Matrix:
+    matrix = np.eye(3)
+    matrix[:2, :2] = linear
+    matrix[:2, 2] = shift
+    return matrix
+
+
+def dlt_homography(a: Doubles, b: Doubles, weights: Doubles | None = None) -> Matrix:
+    """Homography by the normalised Direct Linear Transformation, b ~ H a.
+
+    Hartley & Zisserman, Multiple View Geometry, 2nd ed., algorithm 4.2. Each pair
+    (x, y) -> (u, v) gives two rows of A h = 0 (equation 4.3 with w = 1):
+
+        [ 0  0  0  -x -y -1   vx  vy  v ]
+        [ x  y  1   0  0  0  -ux -uy -u ]
+
+    h, the rows of H one after the other, is the right singular vector of the smallest singular
+    value. Both point sets are first moved to their centroid and scaled to a mean distance of
+    sqrt(2), without which the equations are badly conditioned (Hartley 1997):
+    H = T_b^-1 H' T_a. A pair's two rows are multiplied by the root of its weight.
+
+    Needs at least 4 pairs, no three of which are collinear; ``a``, ``b`` (M, 2).
+    """
+    a_to_unit, b_to_unit = _normaliser(a), _normaliser(b)
+    x, y = (a @ a_to_unit[:2, :2].T + a_to_unit[:2, 2]).T
+    u, v = (b @ b_to_unit[:2, :2].T + b_to_unit[:2, 2]).T
+    root = np.ones(len(a)) if weights is None else np.sqrt(weights)
+    zero, one = np.zeros(len(a)), np.ones(len(a))
+    upper = np.stack([zero, zero, zero, -x, -y, -one, v * x, v * y, v], axis=1)
+    lower = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1)
+    rows = np.concatenate([upper * root[:, None], lower * root[:, None]])
+    # The right singular vectors of A are the eigenvectors of A^T A, which is only 9 x 9; the
+    # normalisation keeps the squared condition number harmless in double precision.
+    smallest = np.linalg.eigh(rows.T @ rows)[1][:, 0].reshape(3, 3)
+    matrix = np.linalg.solve(b_to_unit, smallest @ a_to_unit)
+    corner = matrix[2, 2]
+    return np.asarray(matrix / corner if abs(corner) > 1e-12 else matrix, np.float64)
+
+
+def _normaliser(points: Doubles) -> Matrix:
+    centre = points.mean(axis=0)
+    distance = float(np.mean(np.linalg.norm(points - centre, axis=1)))
+    factor = np.sqrt(2) / distance if distance > 0 else 1.0
+    return np.array(
+        [[factor, 0.0, -factor * centre[0]], [0.0, factor, -factor * centre[1]], [0.0, 0.0, 1.0]]
+    )
+
+
+def gauss_newton_step(start: Matrix, a: Doubles, b: Doubles, weights: Doubles) -> Matrix:
+    """``start`` moved by one step on the weighted transfer error in b.
+
+    The DLT minimises an algebraic error, this the geometric one (Hartley & Zisserman, section
+    4.2.3; Jacobian of equation 4.21). Columns are scaled to unit length for conditioning.
+    """
+    homogeneous, residual = _residuals(start, a, b)
+    jacobian = _homography_jacobian(a, homogeneous) * start[2, 2]
+    length = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian)) + 1e-300
+    jacobian /= length
+    weighted = jacobian * np.repeat(weights, 2)[:, None]
+    normal = weighted.T @ jacobian
+    normal[np.diag_indices(8)] *= 1 + 1e-9
+    try:
+        change = np.linalg.solve(normal, weighted.T @ residual.reshape(-1)) / length
+    except np.linalg.LinAlgError:
+        return start
+    moved = start / start[2, 2] + np.append(change, 0.0).reshape(3, 3)
+    return moved if np.all(np.isfinite(moved)) else start
+
+
+def _residuals(b_from_a: Matrix, a: Doubles, b: Doubles) -> tuple[Doubles, Doubles]:
+    homogeneous = a @ b_from_a[:, :2].T + b_from_a[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mapped = homogeneous[:, :2] / homogeneous[:, 2:]
+    return homogeneous, b - mapped
+
+
+def _homography_jacobian(a: Doubles, homogeneous: Doubles) -> Doubles:
+    """d(u, v) / d(h11 .. h32), shape (2 M, 8), rows u0, v0, u1, v1 ..."""
+    x, y = a.T
+    inverse_depth = 1 / homogeneous[:, 2]
+    u, v = (homogeneous[:, :2] * inverse_depth[:, None]).T
+    jacobian = np.zeros((len(a), 2, 8))
+    ray = np.stack([x, y, np.ones(len(a))], axis=1) * inverse_depth[:, None]
+    jacobian[:, 0, 0:3] = ray
+    jacobian[:, 1, 3:6] = ray
+    jacobian[:, 0, 6:8] = -u[:, None] * ray[:, :2]
+    jacobian[:, 1, 6:8] = -v[:, None] * ray[:, :2]
+    return jacobian.reshape(-1, 8)
+
+
+def transfer_errors(b_from_a: Matrix, a: Points, b: Points) -> Doubles:
+    """Distance (M,) in b between each mapped point of a and its partner; inf at the horizon."""
+    _, residual = _residuals(b_from_a, a.astype(np.float64), b.astype(np.float64))
+    distances: Doubles = np.linalg.norm(residual, axis=1)
+    return np.nan_to_num(distances, nan=np.inf)
+
+
+# -- choice of the model ------------------------------------------------------------------------
+
+
+def choose_model(a: Points, b: Points, settings: RegistrationSettings) -> Model:
+    """The model asked for, or under ``auto`` the one with the least GRIC.
+
+    Geometric Robust Information Criterion (Torr 1998, "Geometric motion segmentation and model
+    selection"): sum of min(e^2 / s^2, 2 (r - d)) + l1 d n + l2 k with r = 4 coordinates a pair,
+    d = 2 dimensions of the manifold, k degrees of freedom, l1 = ln r (the same for all four
+    models, so left out) and l2 = ln(r n). The noise s is that of the richest model's residuals,
+    at least `_MIN_NOISE_PX`. It asks of each further freedom that it pays in residuals.
+    """
+    if settings.model != "auto":
+        return Model(settings.model)
+    residuals = {model: transfer_errors(fit(model, a, b), a, b) for model in DEGREES_OF_FREEDOM}
+    richest = residuals[Model.HOMOGRAPHY]
+    noise_px = max(_MIN_NOISE_PX, float(np.median(richest)) / 1.1774)
+    penalty = log(4 * len(a))
+
+    def gric(model: Model) -> float:
+        cost = np.minimum((residuals[model] / noise_px) ** 2, 4.0)
+        return float(cost.sum()) + penalty * DEGREES_OF_FREEDOM[model]
+
+    return min(DEGREES_OF_FREEDOM, key=gric)
+
+
+_MIN_NOISE_PX = 0.05
+
+
+# -- the gate -----------------------------------------------------------------------------------
+
+
+def _judge_support(
+    a: Points,
+    is_inlier: Mask,
+    settings: RegistrationSettings,
+    region: Points,
+    candidate_area_px: float,
+) -> Verdict:
+    """Are the inliers more than chance would give, and do they span enough of the region?"""
+    inliers = int(np.count_nonzero(is_inlier))
+    if inliers < settings.min_inliers:
+        return Verdict.TOO_FEW_INLIERS
+    disc = np.pi * settings.inlier_threshold_px**2
+    chance = min(0.5, disc / max(candidate_area_px, 4 * disc))
+    if log10_false_alarms(len(a), inliers, chance) > _MAX_LOG10_FALSE_ALARMS:
+        return Verdict.TOO_FEW_INLIERS
+    hull = cv2.convexHull(a[is_inlier].astype(np.float32))
+    share = float(cv2.contourArea(hull)) / max(abs(geometry.signed_area(region)), 1.0)
+    return Verdict.OK if share >= _MIN_SPREAD_SHARE else Verdict.NOT_SPREAD
+
+
+def log10_false_alarms(pairs: int, inliers: int, chance: float) -> float:
+    """Decimal logarithm of how many homographies this good pure noise would be expected to give.
+
+    A-contrario model of Moisan & Stival (2004): with 4 pairs spent on the hypothesis,
+    NFA = (n - 4) C(n, k) C(k, 4) p^(k - 4), p the ``chance`` that a random pair agrees.
+    """
+    if inliers <= 4 or pairs <= 4:
+        return 0.0
+
+    def ln_choose(n: int, k: int) -> float:
+        return lgamma(n + 1) - lgamma(k + 1) - lgamma(n - k + 1)
+
+    ln_nfa = (
+        log(pairs - 4)
+        + ln_choose(pairs, inliers)
+        + ln_choose(inliers, 4)
+        + (inliers - 4) * log(chance)
+    )
+    return ln_nfa / log(10)
+
+
+def judge_mapping(b_from_a: Matrix, region: Points) -> Verdict:
+    """Could a flat thing really look like this? Judged on the quad ``region`` (4, 2) of a.
+
+    Refuses fold-over and mirroring (depth or area changes sign), quads that are not convex,
+    areas that change more than 60-fold, and perspective under which one corner is magnified
+    40 times as much as another.
+    """
+    if not np.all(np.isfinite(b_from_a)):
+        return Verdict.MIRRORED
+    depths = geometry.projective_depths(b_from_a, region)
+    if not (np.all(depths > 0) or np.all(depths < 0)):
+        return Verdict.MIRRORED
+    quad = geometry.transform_points(b_from_a, region)
+    area, area_before = geometry.signed_area(quad), geometry.signed_area(region)
+    if not np.all(np.isfinite(quad)) or area * area_before <= 0:
+        return Verdict.MIRRORED
+    if not geometry.is_convex(quad):
+        return Verdict.NOT_CONVEX
+    if not 1 / _MAX_AREA_RATIO <= area / area_before <= _MAX_AREA_RATIO:
+        return Verdict.AREA
+    # The local area magnification of a homography is |det H| / depth^3.
+    magnification = np.abs(depths) ** -3
+    if magnification.max() > _MAX_PERSPECTIVE_RATIO * magnification.min():
+        return Verdict.PERSPECTIVE
+    return Verdict.OK

@@ -1,0 +1,118 @@
+"""What the user asks to be tracked: a box, a quad, or a template picture, with a name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from streamtrack import geometry
+from streamtrack.errors import TargetError, UsageError
+from streamtrack.types import Image, Points, Size
+
+_FORMS = "x,y,w,h or x1,y1,x2,y2,x3,y3,x4,y4 or the path of a template picture"
+_MIN_SIDE_PX = 8.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Target:
+    """A named thing to follow.
+
+    Either ``quad`` (4, 2), pixels of the first frame, or ``picture``, a BGR or grey image of the
+    thing seen from the front, which is searched for in every frame until found.
+    """
+
+    name: str
+    quad: Points | None = None
+    picture: Image | None = None
+
+    def __post_init__(self) -> None:
+        if (self.quad is None) == (self.picture is None):
+            raise ValueError("a target has either a quad or a picture")
+
+
+def parse_targets(texts: Sequence[str]) -> list[Target]:
+    """Targets from ``[NAME=]x,y,w,h``, ``[NAME=]x1,...,y4`` or ``[NAME=]PICTURE``.
+
+    Without a name, the only target is called ``target``, several ``target1``, ``target2`` ...
+    Raises UsageError for what is no target, TargetError for a picture that cannot be read.
+    """
+    targets = []
+    for number, text in enumerate(texts, start=1):
+        default = "target" if len(texts) == 1 else f"target{number}"
+        targets.append(_parse_target(text, default))
+    names = [target.name for target in targets]
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(f"two targets are called '{name}': give each its own NAME=")
+    return targets
+
+
+def _parse_target(text: str, default_name: str) -> Target:
+    name, separator, rest = text.partition("=")
+    if not separator or not name.strip() or Path(text).is_file():
+        name, rest = default_name, text
+    name, rest = name.strip(), rest.strip()
+    numbers = _parse_numbers(rest)
+    if numbers is None:
+        return Target(name, picture=_read_picture(rest))
+    return Target(name, quad=_quad_from_numbers(numbers, rest))
+
+
+def _parse_numbers(text: str) -> list[float] | None:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        return None
+
+
+def _quad_from_numbers(numbers: list[float], text: str) -> Points:
+    if not np.all(np.isfinite(numbers)):
+        raise UsageError(f"target '{text}': every coordinate must be a finite number")
+    if len(numbers) == 4:
+        x, y, width, height = numbers
+        if width <= 0 or height <= 0:
+            raise UsageError(f"target '{text}': width and height must be positive")
+        return geometry.box_quad(x, y, width, height)
+    if len(numbers) == 8:
+        quad = np.array(numbers, np.float32).reshape(4, 2)
+        if not geometry.is_convex(quad):
+            raise UsageError(
+                f"target '{text}': the four corners must form a convex quad, "
+                "given in order around it from the top-left"
+            )
+        return quad
+    raise UsageError(f"target '{text}': give {_FORMS}")
+
+
+def _read_picture(text: str) -> Image:
+    import cv2
+
+    path = Path(text)
+    if not path.exists():
+        raise UsageError(f"target '{text}' is neither numbers nor a file: give {_FORMS}")
+    data = np.fromfile(path, np.uint8) if path.is_file() else np.zeros(0, np.uint8)
+    picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    if picture is None:
+        raise TargetError(f"template picture {text} cannot be read: give a PNG or JPEG file")
+    return np.asarray(picture, np.uint8)
+
+
+def check_quad_in_picture(name: str, quad: Points, size_wh: Size) -> None:
+    """Raise TargetError unless the quad is large enough and mostly inside a picture."""
+    sides = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1)
+    if sides.min() < _MIN_SIDE_PX:
+        raise TargetError(
+            f"target '{name}' is only {sides.min():.0f} px wide or high: "
+            f"it needs at least {_MIN_SIDE_PX:.0f} px"
+        )
+    share = geometry.visible_share(quad, size_wh)
+    if share < 0.5:
+        x0, y0, x1, y1 = geometry.bounding_box(quad)
+        where = "outside" if share == 0 else "mostly outside"
+        raise TargetError(
+            f"target '{name}' ({x0:.0f},{y0:.0f} to {x1:.0f},{y1:.0f}) lies {where} the "
+            f"{size_wh[0]}x{size_wh[1]} picture: give it in pixels of the first frame"
+        )

@@ -1,0 +1,182 @@
+"""The picture of a target as it was first given: patches at several scales, and features."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from streamtrack import geometry
+from streamtrack.errors import TargetError
+from streamtrack.features import FeatureExtractor
+from streamtrack.types import Features, Image, Mask, Matrix, Points
+
+PATCH_AREA_PX = 36_000
+"""Area of the finest patch: more costs time and gains no accuracy."""
+_MAX_ENLARGEMENT = 2.0
+_SCALE_STEP = 2**-0.5
+_MIN_PATCH_SIDE_PX = 28
+_FLOW_POINTS = 260
+_MIN_FLOW_POINTS = 12
+_MARGIN_SHARE = 0.06
+_MIN_GRADIENT = 2.0
+"""Grey levels per pixel in the weaker direction; noise of sigma 3 gives about 1.3."""
+_FEATURE_BORDER_PX = 48
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patch:
+    """The target at one scale.
+
+    image                the upright patch (h, w) with a margin around the target
+    patch_from_template  template pixels to patch pixels: a shift and a scale
+    scale                patch pixels per template pixel
+    points               float32 (N, 2) textured places inside the target, patch pixels
+    template_points      the same places in template pixels
+    """
+
+    image: Image
+    patch_from_template: Matrix
+    scale: float
+    points: Points
+    template_points: Points
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Template:
+    """A target's quad (4, 2) in the picture it was given in, with all that is matched to it."""
+
+    name: str
+    quad: Points
+    patches: tuple[Patch, ...]
+    features: Features
+    close_up: Image
+
+
+def make_template(name: str, picture: Image, quad: Points, extractor: FeatureExtractor) -> Template:
+    """The template of ``quad`` in ``picture`` (BGR or grey).
+
+    Raises TargetError if there is too little texture to follow it.
+    """
+    grey = geometry.grey_of(picture)
+    patches = _make_patches(grey, quad)
+    if not patches or len(patches[0].points) < _MIN_FLOW_POINTS:
+        found = len(patches[0].points) if patches else 0
+        raise TargetError(
+            f"target '{name}' has too little texture: {found} textured spots, "
+            f"{_MIN_FLOW_POINTS} needed; choose a larger or more structured region"
+        )
+    features = _features_inside(grey, quad, extractor)
+    return Template(name, quad, patches, features, _close_up(picture, quad))
+
+
+def picture_quad(picture: Image) -> Points:
+    """The quad of a target that fills its template picture."""
+    return geometry.image_quad((picture.shape[1], picture.shape[0]))
+
+
+def _make_patches(grey: Image, quad: Points) -> tuple[Patch, ...]:
+    x0, y0, x1, y1 = geometry.bounding_box(quad)
+    margin = max(2.0, _MARGIN_SHARE * max(x1 - x0, y1 - y0))
+    x0, y0, x1, y1 = x0 - margin, y0 - margin, x1 + margin, y1 + margin
+    finest = min(_MAX_ENLARGEMENT, (PATCH_AREA_PX / ((x1 - x0) * (y1 - y0))) ** 0.5)
+    patches = []
+    for step in range(12):
+        scale = finest * _SCALE_STEP**step
+        size = round((x1 - x0) * scale), round((y1 - y0) * scale)
+        if min(size) < _MIN_PATCH_SIDE_PX and patches:
+            break
+        size = max(size[0], 12), max(size[1], 12)
+        patches.append(_make_patch(grey, quad, (x0, y0), scale, size))
+    return tuple(patches)
+
+
+def _make_patch(
+    grey: Image, quad: Points, corner: tuple[float, float], scale: float, size: tuple[int, int]
+) -> Patch:
+    patch_from_template = geometry.scaling(scale) @ geometry.translation(-corner[0], -corner[1])
+    image = warped_area(grey, patch_from_template, size)
+    inside = _polygon_mask(geometry.transform_points(patch_from_template, quad), size)
+    points = _textured_points(image, inside)
+    template_points = geometry.transform_points(geometry.inverted(patch_from_template), points)
+    return Patch(image, patch_from_template, scale, points, template_points)
+
+
+def warped_area(grey: Image, to_from_grey: Matrix, size: tuple[int, int]) -> Image:
+    """``grey`` resampled by a mapping that scales evenly, averaging where it shrinks."""
+    factor = float(np.sqrt(abs(np.linalg.det(to_from_grey[:2, :2]))))
+    while factor < 0.6 and min(grey.shape) >= 2:
+        half = cv2.resize(
+            grey, (grey.shape[1] // 2, grey.shape[0] // 2), interpolation=cv2.INTER_AREA
+        )
+        half_from_grey = geometry.scaling(
+            half.shape[1] / grey.shape[1], half.shape[0] / grey.shape[0]
+        )
+        to_from_grey = to_from_grey @ geometry.inverted(half_from_grey)
+        grey = np.asarray(half, np.uint8)
+        factor *= 2
+    flags = cv2.INTER_LINEAR if factor < 1.1 else cv2.INTER_CUBIC
+    warped = cv2.warpPerspective(
+        grey, to_from_grey, size, flags=flags, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(warped, np.uint8)
+
+
+def _polygon_mask(polygon: Points, size: tuple[int, int]) -> Mask:
+    mask = np.zeros((size[1], size[0]), np.uint8)
+    cv2.fillConvexPoly(mask, np.rint(polygon).astype(np.int32), 1)
+    inside: Mask = mask > 0
+    return inside
+
+
+def smallest_gradient(image: Image) -> npt.NDArray[np.float32]:
+    """Root of the structure tensor's smaller eigenvalue over 7x7, grey levels per pixel (h, w).
+
+    It is what a shift changes in the direction in which it changes least, and so how well a
+    place can be located (Shi & Tomasi 1994).
+    """
+    eigenvalue = np.asarray(cv2.cornerMinEigenVal(image, 7, ksize=3), np.float32)
+    # OpenCV divides 8-bit Sobel responses (gain 8) by 4 * 255 * block and sums block^2 of them.
+    return np.sqrt(np.maximum(eigenvalue, 0)) * np.float32(4 * 255 / 8)
+
+
+def _textured_points(image: Image, inside: Mask) -> Points:
+    """The most textured pixel of every grid cell inside the target, where there is texture."""
+    strength = np.where(inside, smallest_gradient(image), 0)
+    cell = max(3, int(np.sqrt(np.count_nonzero(inside) / _FLOW_POINTS)))
+    rows, columns = -(-image.shape[0] // cell), -(-image.shape[1] // cell)
+    padded = np.zeros((rows * cell, columns * cell), np.float32)
+    padded[: image.shape[0], : image.shape[1]] = strength
+    cells = padded.reshape(rows, cell, columns, cell).swapaxes(1, 2).reshape(rows * columns, -1)
+    best = cells.argmax(axis=1)
+    textured = np.flatnonzero(cells.max(axis=1) >= _MIN_GRADIENT)
+    y = (textured // columns) * cell + best[textured] // cell
+    x = (textured % columns) * cell + best[textured] % cell
+    points: Points = np.stack([x, y], axis=1).astype(np.float32)
+    return points
+
+
+def _features_inside(grey: Image, quad: Points, extractor: FeatureExtractor) -> Features:
+    """Features inside the quad; the surroundings are kept so that descriptors see them."""
+    x0, y0, x1, y1 = (round(v) for v in geometry.bounding_box(quad))
+    border = _FEATURE_BORDER_PX
+    padded = cv2.copyMakeBorder(grey, border, border, border, border, cv2.BORDER_REPLICATE)
+    height, width = grey.shape
+    left, right = max(0, x0), min(width, x1 + 1) + 2 * border
+    top, bottom = max(0, y0), min(height, y1 + 1) + 2 * border
+    crop = np.ascontiguousarray(padded[top:bottom, left:right], np.uint8)
+    offset = np.array([left - border, top - border], np.float32)
+    mask = _polygon_mask(quad - offset, (crop.shape[1], crop.shape[0])).astype(np.uint8)
+    found = extractor.extract(crop, mask)
+    return Features(found.points + offset, found.sizes, found.responses, found.descriptors)
+
+
+def _close_up(picture: Image, quad: Points) -> Image:
+    """The target's bounding box cut from its picture, for people to look at."""
+    x0, y0, x1, y1 = geometry.bounding_box(quad)
+    height, width = picture.shape[:2]
+    top, bottom = max(0, int(y0)), min(height, int(np.ceil(y1)) + 1)
+    left, right = max(0, int(x0)), min(width, int(np.ceil(x1)) + 1)
+    return picture[top:bottom, left:right].copy()

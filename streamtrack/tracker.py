@@ -1,0 +1,191 @@
+"""Following one target from frame to frame.
+
+Two methods with one interface. `DetectTracker` is the ancestor's loop: every frame by itself,
+its features against the target's. `HybridTracker` predicts the pose, warps the frame back by it,
+measures the remaining flow against the first-frame picture, and falls back on features, first
+near the prediction and then everywhere, when the gate refuses. Both say ``lost`` at once, and
+neither ever repeats an old quad.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from streamtrack import geometry
+from streamtrack.flow import Alignment, FlowAligner
+from streamtrack.matching import match, match_guided
+from streamtrack.registration import fit, register
+from streamtrack.settings import Settings
+from streamtrack.template import Template
+from streamtrack.types import (
+    Evidence,
+    Matches,
+    Matrix,
+    Model,
+    Points,
+    Registration,
+    Track,
+    TrackState,
+    Verdict,
+)
+from streamtrack.view import FrameView
+
+_GUIDED_RADIUS_PX = 60.0
+_COAST_FRAMES = 10
+
+
+class TargetTracker(Protocol):
+    """What the pipeline asks of a method of following one target."""
+
+    @property
+    def template(self) -> Template: ...
+
+    def update(self, view: FrameView) -> Track:
+        """The target in the next frame."""
+        ...
+
+
+class DetectTracker:
+    """Stateless: the frame's features against the target's, everywhere, in every frame."""
+
+    def __init__(self, template: Template, settings: Settings) -> None:
+        self.template = template
+        self._settings = settings
+        self._was_seen = False
+
+    def update(self, view: FrameView) -> Track:
+        features = view.features()
+        matches = match(self.template.features, features, self._settings.matching)
+        found = _register_features(self.template, view, matches, self._settings)
+        evidence = _feature_evidence(self.template, view, matches, found)
+        self._was_seen |= found.verdict is Verdict.OK
+        return make_track(self.template, found, evidence, "detect", self._was_seen)
+
+
+class HybridTracker:
+    """Predict, warp back, flow against the first frame, gate; features when that fails."""
+
+    def __init__(
+        self, template: Template, settings: Settings, first_pose: Matrix | None = None
+    ) -> None:
+        self.template = template
+        self._settings = settings
+        self._aligner = FlowAligner(template, settings.registration)
+        self._pose = first_pose
+        self._step_pose: Matrix | None = None
+        self._frames_lost = 0
+        self._was_seen = first_pose is not None
+
+    def update(self, view: FrameView) -> Track:
+        followed = self._follow(view)
+        if followed is not None and followed.registration.verdict is Verdict.OK:
+            return self._tracked(followed, "flow")
+        detected, evidence, means = self._detect(view)
+        if detected.b_from_a is not None:
+            confirmed = self._aligner.align(view, detected.b_from_a)
+            if confirmed.registration.verdict is Verdict.OK:
+                return self._tracked(confirmed, means)
+            detected = confirmed.registration
+        self._frames_lost += 1
+        verdict = detected if followed is None else followed.registration
+        return make_track(self.template, verdict, evidence, means, self._was_seen)
+
+    def _follow(self, view: FrameView) -> Alignment | None:
+        if self._pose is None or self._frames_lost > _COAST_FRAMES:
+            return None
+        guess = self._pose if self._step_pose is None else self._step_pose @ self._pose
+        return self._aligner.align(view, guess)
+
+    def _detect(self, view: FrameView) -> tuple[Registration, Evidence, str]:
+        """By features: near the last place while the loss is fresh, else everywhere."""
+        features = view.features()
+        if self._pose is not None and self._frames_lost == 0:
+            predicted = geometry.transform_points(self._pose, self.template.features.points)
+            matches = match_guided(
+                self.template.features,
+                features,
+                predicted,
+                _GUIDED_RADIUS_PX,
+                self._settings.matching,
+            )
+            found = _register_features(self.template, view, matches, self._settings)
+            if found.verdict is Verdict.OK:
+                return found, _feature_evidence(self.template, view, matches, found), "guided"
+        matches = match(self.template.features, features, self._settings.matching)
+        found = _register_features(self.template, view, matches, self._settings)
+        return found, _feature_evidence(self.template, view, matches, found), "global"
+
+    def _tracked(self, alignment: Alignment, means: str) -> Track:
+        found = alignment.registration
+        assert found.b_from_a is not None
+        if self._pose is not None and self._frames_lost == 0 and means == "flow":
+            self._step_pose = _shared_motion(self.template.quad, self._pose, found.b_from_a)
+        else:
+            self._step_pose = None
+        self._pose = found.b_from_a
+        self._frames_lost = 0
+        self._was_seen = True
+        evidence = Evidence(alignment.template_points, alignment.frame_points, found.is_inlier)
+        return make_track(
+            self.template, found, evidence, means, self._was_seen, alignment.correlation
+        )
+
+
+def _shared_motion(quad: Points, before: Matrix, after: Matrix) -> Matrix:
+    """The similarity that carried the quad from one frame to the next, for the prediction.
+
+    Four freedoms extrapolate well; the perspective ones would mostly extrapolate noise.
+    """
+    return fit(
+        Model.SIMILARITY,
+        geometry.transform_points(before, quad),
+        geometry.transform_points(after, quad),
+    )
+
+
+def _register_features(
+    template: Template, view: FrameView, matches: Matches, settings: Settings
+) -> Registration:
+    width, height = view.size_wh
+    return register(
+        template.features.points[matches.ref],
+        view.features().points[matches.cur],
+        settings.registration,
+        template.quad,
+        float(width * height),
+    )
+
+
+def _feature_evidence(
+    template: Template, view: FrameView, matches: Matches, found: Registration
+) -> Evidence:
+    return Evidence(
+        template.features.points[matches.ref],
+        view.features().points[matches.cur],
+        found.is_inlier,
+    )
+
+
+def make_track(
+    template: Template,
+    found: Registration,
+    evidence: Evidence,
+    means: str,
+    was_seen: bool,
+    correlation: float = float("nan"),
+) -> Track:
+    """The track that a registration stands for: a quad if it is OK, else the reason why not."""
+    if found.b_from_a is None:
+        state = TrackState.LOST if was_seen else TrackState.SEARCHING
+        return Track(template.name, state, evidence=evidence, means=means, reason=found.verdict)
+    return Track(
+        template.name,
+        TrackState.TRACKING,
+        quad=geometry.transform_points(found.b_from_a, template.quad),
+        frame_from_template=found.b_from_a,
+        model=found.model,
+        evidence=evidence,
+        rmse_px=found.rmse_px,
+        correlation=correlation,
+        means=means,
+    )

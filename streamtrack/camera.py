@@ -42,7 +42,7 @@ def make_camera(settings: Settings) -> CameraEstimator:
 class FixedCamera:
     """A camera on a tripod: the world is the picture."""
 
-    def update(self, view: FrameView, tracks: Sequence[Track]) -> CameraPose:  # noqa: ARG002
+    def update(self, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
         return CameraPose(np.eye(3))
 
 

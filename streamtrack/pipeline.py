@@ -6,6 +6,8 @@ import time
 from collections.abc import Iterator, Sequence
 from itertools import islice
 
+import numpy as np
+
 from streamtrack import geometry
 from streamtrack.camera import make_camera
 from streamtrack.errors import UsageError
@@ -13,7 +15,7 @@ from streamtrack.features import FeatureExtractor
 from streamtrack.settings import Settings
 from streamtrack.sources.base import FrameSource
 from streamtrack.targets import Target, check_quad_in_picture
-from streamtrack.template import make_template, picture_quad
+from streamtrack.template import make_template
 from streamtrack.tracker import DetectTracker, HybridTracker, TargetTracker
 from streamtrack.types import Step, Track
 from streamtrack.view import FrameView
@@ -79,15 +81,12 @@ def make_tracker(
     target: Target, view: FrameView, extractor: FeatureExtractor, settings: Settings
 ) -> TargetTracker:
     """The tracker of one target; ``view`` is the first frame, in which its quad lies."""
-    if target.quad is not None:
-        check_quad_in_picture(target.name, target.quad, view.size_wh)
-        template = make_template(target.name, view.frame.image, target.quad, extractor)
-        first_pose = geometry.translation(0, 0)
-    else:
-        assert target.picture is not None
-        quad = picture_quad(target.picture)
-        template = make_template(target.name, target.picture, quad, extractor)
-        first_pose = None
+    picture = view.frame.image if target.picture is None else target.picture
+    size_wh = (picture.shape[1], picture.shape[0])
+    quad = geometry.image_quad(size_wh) if target.quad is None else target.quad
+    check_quad_in_picture(target.name, quad, size_wh)
+    template = make_template(target.name, picture, quad, extractor)
+    first_pose = np.eye(3) if target.picture is None else None
     if settings.tracker.method == "detect":
         return DetectTracker(template, settings)
     return HybridTracker(template, settings, first_pose)

@@ -12,7 +12,7 @@ from streamtrack import geometry
 from streamtrack.errors import TargetError, UsageError
 from streamtrack.types import Image, Points, Size
 
-_FORMS = "x,y,w,h or x1,y1,x2,y2,x3,y3,x4,y4 or the path of a template picture"
+_FORMS = "x,y,w,h or x1,y1,x2,y2,x3,y3,x4,y4 or PICTURE or PICTURE@x,y,w,h"
 _MIN_SIDE_PX = 8.0
 
 
@@ -20,8 +20,9 @@ _MIN_SIDE_PX = 8.0
 class Target:
     """A named thing to follow.
 
-    Either ``quad`` (4, 2), pixels of the first frame, or ``picture``, a BGR or grey image of the
-    thing seen from the front, which is searched for in every frame until found.
+    Without ``picture`` (BGR or grey), ``quad`` (4, 2) are pixels of the first frame. With it, the
+    thing is searched for in every frame until found; ``quad`` are then pixels of the picture,
+    and the whole picture if None.
     """
 
     name: str
@@ -29,12 +30,14 @@ class Target:
     picture: Image | None = None
 
     def __post_init__(self) -> None:
-        if (self.quad is None) == (self.picture is None):
-            raise ValueError("a target has either a quad or a picture")
+        if self.quad is None and self.picture is None:
+            raise ValueError("a target has a quad, a picture or both")
 
 
 def parse_targets(texts: Sequence[str]) -> list[Target]:
-    """Targets from ``[NAME=]x,y,w,h``, ``[NAME=]x1,...,y4`` or ``[NAME=]PICTURE``.
+    """Targets from ``[NAME=]x,y,w,h``, ``[NAME=]x1,...,y4`` or ``[NAME=]PICTURE[@region]``.
+
+    The region of a picture is given as a box or a quad too, in the picture's pixels.
 
     Without a name, the only target is called ``target``, several ``target1``, ``target2`` ...
     Raises UsageError for what is no target, TargetError for a picture that cannot be read.
@@ -56,9 +59,13 @@ def _parse_target(text: str, default_name: str) -> Target:
         name, rest = default_name, text
     name, rest = name.strip(), rest.strip()
     numbers = _parse_numbers(rest)
-    if numbers is None:
+    if numbers is not None:
+        return Target(name, quad=_quad_from_numbers(numbers, rest))
+    path, _, region = rest.rpartition("@")
+    region_numbers = _parse_numbers(region)
+    if not path or region_numbers is None:
         return Target(name, picture=_read_picture(rest))
-    return Target(name, quad=_quad_from_numbers(numbers, rest))
+    return Target(name, _quad_from_numbers(region_numbers, rest), _read_picture(path))
 
 
 def _parse_numbers(text: str) -> list[float] | None:

@@ -49,10 +49,10 @@ class Template:
     """A target's quad (4, 2) in the picture it was given in, with all that is matched to it."""
 
     name: str
+    picture: Image
     quad: Points
     patches: tuple[Patch, ...]
     features: Features
-    close_up: Image
 
 
 def make_template(name: str, picture: Image, quad: Points, extractor: FeatureExtractor) -> Template:
@@ -69,12 +69,7 @@ def make_template(name: str, picture: Image, quad: Points, extractor: FeatureExt
             f"{_MIN_FLOW_POINTS} needed; choose a larger or more structured region"
         )
     features = _features_inside(grey, quad, extractor)
-    return Template(name, quad, patches, features, _close_up(picture, quad))
-
-
-def picture_quad(picture: Image) -> Points:
-    """The quad of a target that fills its template picture."""
-    return geometry.image_quad((picture.shape[1], picture.shape[0]))
+    return Template(name, picture, quad, patches, features)
 
 
 def _make_patches(grey: Image, quad: Points) -> tuple[Patch, ...]:
@@ -171,12 +166,3 @@ def _features_inside(grey: Image, quad: Points, extractor: FeatureExtractor) -> 
     mask = _polygon_mask(quad - offset, (crop.shape[1], crop.shape[0])).astype(np.uint8)
     found = extractor.extract(crop, mask)
     return Features(found.points + offset, found.sizes, found.responses, found.descriptors)
-
-
-def _close_up(picture: Image, quad: Points) -> Image:
-    """The target's bounding box cut from its picture, for people to look at."""
-    x0, y0, x1, y1 = geometry.bounding_box(quad)
-    height, width = picture.shape[:2]
-    top, bottom = max(0, int(y0)), min(height, int(np.ceil(y1)) + 1)
-    left, right = max(0, int(x0)), min(width, int(np.ceil(x1)) + 1)
-    return picture[top:bottom, left:right].copy()

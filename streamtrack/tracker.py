@@ -9,12 +9,20 @@ neither ever repeats an old quad.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Protocol
 
+import numpy as np
+
 from streamtrack import geometry
+from streamtrack.appearance import (
+    MAX_CHROMA_DISTANCE,
+    MAX_CHROMA_DISTANCE_OTHER_CAMERA,
+    chroma_distance,
+)
 from streamtrack.flow import Alignment, FlowAligner
 from streamtrack.matching import match, match_guided
-from streamtrack.registration import fit, register
+from streamtrack.registration import fit, refused, register
 from streamtrack.settings import Settings
 from streamtrack.template import Template
 from streamtrack.types import (
@@ -32,6 +40,7 @@ from streamtrack.view import FrameView
 
 _GUIDED_RADIUS_PX = 60.0
 _COAST_FRAMES = 10
+_COLOR_REACH_SHARE = 0.04
 
 
 class TargetTracker(Protocol):
@@ -75,6 +84,10 @@ class HybridTracker:
         self._step_pose: Matrix | None = None
         self._frames_lost = 0
         self._was_seen = first_pose is not None
+        is_same_camera = first_pose is not None
+        self._max_chroma_distance = (
+            MAX_CHROMA_DISTANCE if is_same_camera else MAX_CHROMA_DISTANCE_OTHER_CAMERA
+        )
 
     def update(self, view: FrameView) -> Track:
         followed = self._follow(view)
@@ -82,7 +95,7 @@ class HybridTracker:
             return self._tracked(followed, "flow")
         detected, evidence, means = self._detect(view)
         if detected.b_from_a is not None:
-            confirmed = self._aligner.align(view, detected.b_from_a)
+            confirmed = self._with_own_colors(self._aligner.align(view, detected.b_from_a), view)
             if confirmed.registration.verdict is Verdict.OK:
                 return self._tracked(confirmed, means)
             detected = confirmed.registration
@@ -94,7 +107,25 @@ class HybridTracker:
         if self._pose is None or self._frames_lost > _COAST_FRAMES:
             return None
         guess = self._pose if self._step_pose is None else self._step_pose @ self._pose
-        return self._aligner.align(view, guess)
+        followed = self._aligner.align(view, guess)
+        return followed if self._frames_lost == 0 else self._with_own_colors(followed, view)
+
+    def _with_own_colors(self, alignment: Alignment, view: FrameView) -> Alignment:
+        """The alignment, refused if what it found has other colours than the target."""
+        found = alignment.registration
+        if found.b_from_a is None:
+            return alignment
+        distance = chroma_distance(
+            self.template.picture,
+            alignment.template_points[found.is_inlier],
+            view.frame.image,
+            found.b_from_a,
+            _COLOR_REACH_SHARE * float(np.sqrt(abs(geometry.signed_area(self.template.quad)))),
+        )
+        if distance <= self._max_chroma_distance:
+            return alignment
+        refusal = refused(Verdict.OTHER_COLORS, len(found.is_inlier), found.is_inlier)
+        return replace(alignment, registration=refusal)
 
     def _detect(self, view: FrameView) -> tuple[Registration, Evidence, str]:
         """By features: near the last place while the loss is fresh, else everywhere."""

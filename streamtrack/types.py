@@ -185,6 +185,7 @@ class Verdict(StrEnum):
     AREA = "area changed beyond belief"
     PERSPECTIVE = "perspective beyond belief"
     LOW_CORRELATION = "picture does not correlate with the target"
+    OTHER_COLORS = "colours differ from the target's"
     OUT_OF_VIEW = "target out of view"
 
 

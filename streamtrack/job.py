@@ -1,0 +1,170 @@
+"""One tracking run from source to closed outputs: opens everything, loops, closes everything.
+
+Watchers (recording, table, poses, annotated video, summary) see each `Step` and decide nothing.
+Whatever ends the run, what was produced until then is kept and properly closed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
+from itertools import chain
+from pathlib import Path
+from typing import Protocol
+
+from streamtrack.errors import SourceError, StreamtrackError
+from streamtrack.pipeline import track
+from streamtrack.results import PosesWriter, check_tracks_path, open_tracks_writer
+from streamtrack.settings import Settings
+from streamtrack.sources import open_source
+from streamtrack.sources.base import FrameSource
+from streamtrack.summary import Summary, SummaryBuilder
+from streamtrack.targets import Target
+from streamtrack.types import SourceInfo, Step
+
+_FALLBACK_RATE_HZ = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """Where the results go; None where they are not wanted."""
+
+    record: Path | None = None
+    tracks: Path | None = None
+    poses: Path | None = None
+    video: Path | None = None
+    summary: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TrackJob:
+    """All that one run needs to know."""
+
+    source: str | Sequence[str]
+    targets: Sequence[Target]
+    settings: Settings = field(default_factory=Settings)
+    outputs: Outputs = field(default_factory=Outputs)
+    start: int = 0
+    step: int = 1
+    frames: int | None = None
+
+
+class Progress(Protocol):
+    """Told of the run's progress, so that a person can be."""
+
+    def begin(self, info: SourceInfo, frames: int | None) -> None: ...
+
+    def advance(self, step: Step) -> None: ...
+
+
+def run_track(job: TrackJob, progress: Progress, should_stop: Callable[[], bool]) -> Summary:
+    """Run the job and return its summary.
+
+    Raises StreamtrackError after closing all outputs; the summary is written even then, its
+    ``ended`` saying why.
+    """
+    with ExitStack() as stack:
+        source = stack.enter_context(
+            open_source(job.source, with_packets=job.outputs.record is not None)
+        )
+        if job.outputs.tracks is not None:
+            check_tracks_path(job.outputs.tracks)
+        builder = SummaryBuilder(source.info, job.settings)
+        steps = stack.enter_context(closing(_steps(job, source)))
+        # A target that does not fit the first frame is refused before any output is touched.
+        first = next(steps, None)
+        if first is None:
+            raise SourceError(f"{source.info.name}: no frame could be read")
+        watchers, finish = _open_watchers(job, source, stack)
+        progress.begin(source.info, _expected_frames(job, source.info))
+        error: StreamtrackError | None = None
+        ended = "end of source"
+        try:
+            for step in chain([first], steps):
+                for watch in watchers:
+                    watch(step)
+                builder.add(step)
+                progress.advance(step)
+                if should_stop():
+                    ended = f"interrupted after frame {step.frame.index}"
+                    break
+        except StreamtrackError as raised:
+            error, ended = raised, str(raised)
+        summary = builder.build(source.skipped, source.corrupt_packets, ended)
+        finish(summary)
+    if error is not None:
+        raise error
+    return summary
+
+
+def _steps(job: TrackJob, source: FrameSource) -> Iterator[Step]:
+    return track(
+        source, job.targets, job.settings, start=job.start, step=job.step, frames=job.frames
+    )
+
+
+def _expected_frames(job: TrackJob, info: SourceInfo) -> int | None:
+    if info.frame_count is None:
+        return job.frames
+    available = max(0, -(-(info.frame_count - job.start) // job.step))
+    return available if job.frames is None else min(available, job.frames)
+
+
+def _open_watchers(
+    job: TrackJob, source: FrameSource, stack: ExitStack
+) -> tuple[list[Callable[[Step], None]], Callable[[Summary], None]]:
+    """What to call for each Step, and what to call with the summary at the end."""
+    outputs, info = job.outputs, source.info
+    watchers: list[Callable[[Step], None]] = []
+    finishers: list[Callable[[Summary], None]] = []
+    if outputs.summary is not None:
+        finishers.append(_summary_finisher(outputs.summary))
+    if outputs.tracks is not None:
+        watchers.append(stack.enter_context(open_tracks_writer(outputs.tracks)).write)
+    if outputs.poses is not None:
+        poses = stack.enter_context(PosesWriter(outputs.poses))
+        watchers.append(poses.write)
+        finishers.append(_skipped_finisher(poses))
+    if outputs.video is not None:
+        watchers.append(_video_watcher(outputs.video, info, stack))
+    if outputs.record is not None:
+        from streamtrack.recording import Recorder
+
+        views = {t.name: t.picture for t in job.targets if t.picture is not None}
+        names = [target.name for target in job.targets]
+        recorder = stack.enter_context(Recorder(outputs.record, info, job.settings, names, views))
+        watchers.append(recorder.log)
+        finishers.append(lambda summary: recorder.close(summary.to_markdown()))
+
+    def finish(summary: Summary) -> None:
+        for finisher in finishers:
+            finisher(summary)
+
+    return watchers, finish
+
+
+def _summary_finisher(path: Path) -> Callable[[Summary], None]:
+    return lambda summary: summary.write_json(path)
+
+
+def _skipped_finisher(poses: PosesWriter) -> Callable[[Summary], None]:
+    def finish(summary: Summary) -> None:
+        for skipped in summary.skipped:
+            poses.write_skipped(skipped)
+
+    return finish
+
+
+def _video_watcher(path: Path, info: SourceInfo, stack: ExitStack) -> Callable[[Step], None]:
+    from streamtrack.overlay import Trails, draw_step
+    from streamtrack.sources.writer import VideoWriter
+
+    rate_hz = info.rate_hz or _FALLBACK_RATE_HZ
+    writer = stack.enter_context(VideoWriter(path, rate_hz=rate_hz))
+    trails = Trails()
+
+    def watch(step: Step) -> None:
+        writer.write(draw_step(step, trail=trails.follow(step)), step.frame.time_s)
+
+    return watch

@@ -1,0 +1,300 @@
+"""How the picture gets into a recording: copied packets, the embedded file, AV1 or JPEG."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import time
+from collections import deque
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+import rerun as rr
+
+from streamtrack.blueprint import IMAGE
+from streamtrack.errors import OutputError
+from streamtrack.settings import RecordingSettings, VideoMode
+from streamtrack.sources.encoder import Av1Encoder
+from streamtrack.types import Frame, Image, Packet, Size, SourceInfo
+
+_log = logging.getLogger("streamtrack.recording")
+
+_CODECS = {
+    "h264": rr.VideoCodec.H264,
+    "hevc": rr.VideoCodec.H265,
+    "av1": rr.VideoCodec.AV1,
+    "vp8": rr.VideoCodec.VP8,
+    "vp9": rr.VideoCodec.VP9,
+}
+_BEHIND_OVERLAYS = -10.0
+_SAME_TIME_S = 1e-6
+_MAX_WAITING = 64
+"""Packets kept for a frame to come; a decoder holds back far fewer."""
+
+
+class Clock:
+    """Sets the timelines for what the calling thread logs next."""
+
+    def __init__(self, stream: rr.RecordingStream, is_live: bool) -> None:
+        self._stream = stream
+        self._is_live = is_live
+        self._epoch_s: float | None = None
+
+    def set(self, index: int, time_s: float) -> None:
+        """``capture_time`` is the wall time of the first frame plus the source's own time since."""
+        self._stream.set_time("frame", sequence=index)
+        self._stream.set_time("video_time", duration=time_s)
+        if self._is_live:
+            if self._epoch_s is None:
+                self._epoch_s = time.time() - time_s
+            self._stream.set_time("capture_time", timestamp=self._epoch_s + time_s)
+
+
+class Video(Protocol):
+    """One way of recording pictures."""
+
+    def log(self, frame: Frame) -> int:
+        """Record the picture, leaving any time on the clock. The bytes that it took, about."""
+        ...
+
+    def close(self) -> None:
+        """Record what was held back."""
+        ...
+
+
+def open_video(
+    stream: rr.RecordingStream, clock: Clock, source: SourceInfo, settings: RecordingSettings
+) -> Video:
+    """The cheapest way that the settings allow and the source can serve."""
+    mode, codec = settings.video, source.packet_codec
+    if mode is VideoMode.NONE:
+        return without_video()
+    if codec == "mjpeg" and mode in (VideoMode.AUTO, VideoMode.JPEG):
+        return _CopiedJpegs(stream, clock)
+    if codec in _CODECS and (mode is VideoMode.AUTO or (mode is VideoMode.AV1 and codec == "av1")):
+        if codec != "av1":
+            _warn_if_ffmpeg_is_missing(codec)
+        return _CopiedPackets(stream, clock, _CODECS[codec])
+    if mode is VideoMode.AUTO and source.asset_path is not None:
+        try:
+            video = _EmbeddedFile(stream, clock, source.asset_path, settings.max_asset_mb)
+        except (OSError, RuntimeError, ValueError) as error:
+            _log.info("%s is recorded as JPEG: %s", source.name, error)
+        else:
+            _warn_if_ffmpeg_is_missing("H.264 or H.265")
+            return video
+    if mode is VideoMode.AV1:
+        try:
+            return _EncodedAv1(stream, clock, source.size_wh, source.rate_hz)
+        except OutputError as error:
+            _log.warning("%s; JPEG is recorded instead", error)
+    return _EncodedJpegs(stream, clock, settings.jpeg_quality)
+
+
+def without_video() -> Video:
+    """Records no picture."""
+    return _NoVideo()
+
+
+def _warn_if_ffmpeg_is_missing(codec: str) -> None:
+    if shutil.which("ffmpeg") is None:
+        _log.warning(
+            "the native Rerun viewer shows the %s video of this recording only with an ffmpeg "
+            "executable on PATH; 'streamtrack view --web' or '--video-mode av1|jpeg' needs none",
+            codec,
+        )
+
+
+class _NoVideo:
+    def log(self, frame: Frame) -> int:  # noqa: ARG002
+        return 0
+
+    def close(self) -> None:
+        pass
+
+
+class _EncodedJpegs:
+    def __init__(self, stream: rr.RecordingStream, clock: Clock, quality: int) -> None:
+        self._stream = stream
+        self._clock = clock
+        self._quality = quality
+        _log_jpeg_style(stream)
+
+    def log(self, frame: Frame) -> int:
+        data = jpeg_of(frame.image, self._quality)
+        self._clock.set(frame.index, frame.time_s)
+        self._stream.log(IMAGE, rr.EncodedImage.from_fields(blob=data))
+        return len(data)
+
+    def close(self) -> None:
+        pass
+
+
+def jpeg_of(image: Image, quality: int) -> bytes:
+    """The picture as JPEG. Raises OutputError if it is too large for that."""
+    try:
+        is_done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    except cv2.error:
+        is_done, data = False, np.zeros(0, np.uint8)
+    if not is_done:
+        raise OutputError(f"cannot encode {image.shape[1]}x{image.shape[0]} pixels as JPEG")
+    return data.tobytes()
+
+
+def _log_jpeg_style(stream: rr.RecordingStream) -> None:
+    style = rr.EncodedImage.from_fields(media_type="image/jpeg", draw_order=_BEHIND_OVERLAYS)
+    stream.log(IMAGE, style, static=True)
+
+
+class _PacketQueue:
+    """Hands out packets, in the order of decoding, when the frame that shows them has come."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[Packet] = deque()
+
+    def due(self, frame: Frame) -> list[Packet]:
+        self._waiting.extend(frame.packets)
+        now = frame.time_s + _SAME_TIME_S
+        packets: list[Packet] = []
+        while self._waiting and (
+            self._waiting[0].time_s <= now or len(self._waiting) > _MAX_WAITING
+        ):
+            packets.append(self._waiting.popleft())
+        return packets
+
+    def rest(self) -> list[Packet]:
+        packets = list(self._waiting)
+        self._waiting.clear()
+        return packets
+
+
+class _SampleLog:
+    """Logs video samples, each later than the one before, as the viewer needs them."""
+
+    def __init__(self, stream: rr.RecordingStream, clock: Clock, codec: rr.VideoCodec) -> None:
+        self._stream = stream
+        self._clock = clock
+        self._last_s = -np.inf
+        stream.log(
+            IMAGE,
+            rr.VideoStream.from_fields(codec=codec, draw_order=_BEHIND_OVERLAYS),
+            static=True,
+        )
+
+    def log(self, index: int, packet: Packet) -> int:
+        self._last_s = max(packet.time_s, self._last_s + _SAME_TIME_S)
+        self._clock.set(index, self._last_s)
+        sample = rr.VideoStream.from_fields(sample=packet.data, is_keyframe=packet.is_keyframe)
+        self._stream.log(IMAGE, sample)
+        return len(packet.data)
+
+
+class _CopiedPackets:
+    """One packet is one picture (there are no B-frames), so the pictures that were stepped over
+    get the indices between those of the yielded frames. Where there are more packets than
+    indices several share the frame's: the viewer decodes them all and shows the last."""
+
+    def __init__(self, stream: rr.RecordingStream, clock: Clock, codec: rr.VideoCodec) -> None:
+        self._queue = _PacketQueue()
+        self._samples = _SampleLog(stream, clock, codec)
+        self._next_index = 0
+
+    def log(self, frame: Frame) -> int:
+        packets = self._queue.due(frame)
+        first = max(frame.index - len(packets) + 1, self._next_index)
+        self._next_index = frame.index + 1
+        return sum(
+            self._samples.log(min(first + number, frame.index), packet)
+            for number, packet in enumerate(packets)
+        )
+
+    def close(self) -> None:
+        for index, packet in enumerate(self._queue.rest(), self._next_index):
+            self._samples.log(index, packet)
+
+
+class _CopiedJpegs:
+    def __init__(self, stream: rr.RecordingStream, clock: Clock) -> None:
+        self._queue = _PacketQueue()
+        self._stream = stream
+        self._clock = clock
+        _log_jpeg_style(stream)
+
+    def log(self, frame: Frame) -> int:
+        packets = self._queue.due(frame)
+        if not packets:
+            return 0
+        self._clock.set(frame.index, frame.time_s)
+        self._stream.log(IMAGE, rr.EncodedImage.from_fields(blob=packets[-1].data))
+        return len(packets[-1].data)
+
+    def close(self) -> None:
+        pass
+
+
+class _EncodedAv1:
+    """A new size of picture starts a new encoder in the same stream, on a keyframe."""
+
+    def __init__(
+        self, stream: rr.RecordingStream, clock: Clock, size_wh: Size, rate_hz: float | None
+    ) -> None:
+        self._encoder = Av1Encoder(size_wh, rate_hz)
+        self._rate_hz = rate_hz
+        self._samples = _SampleLog(stream, clock, rr.VideoCodec.AV1)
+        self._indices: deque[int] = deque()
+
+    def log(self, frame: Frame) -> int:
+        size = 0
+        if frame.size_wh != self._encoder.size_wh:
+            size += self._log_packets(self._encoder.flush())
+            self._indices.clear()
+            self._encoder = Av1Encoder(frame.size_wh, self._rate_hz)
+        self._indices.append(frame.index)
+        return size + self._log_packets(self._encoder.encode(frame.image, frame.time_s))
+
+    def close(self) -> None:
+        self._log_packets(self._encoder.flush())
+
+    def _log_packets(self, packets: list[Packet]) -> int:
+        return sum(self._samples.log(self._indices.popleft(), packet) for packet in packets)
+
+
+class _EmbeddedFile:
+    """The source's file, whole; each frame refers to its picture in there."""
+
+    def __init__(
+        self, stream: rr.RecordingStream, clock: Clock, path: Path, max_size_mb: float
+    ) -> None:
+        size_mb = path.stat().st_size / 1e6
+        if size_mb > max_size_mb:
+            raise ValueError(f"{size_mb:.0f} MB are more than the {max_size_mb:g} MB to embed")
+        asset = rr.AssetVideo(path=path)
+        self._times_ns = np.sort(np.asarray(asset.read_frame_timestamps_nanos(), np.int64))
+        if len(self._times_ns) == 0:
+            raise ValueError("no picture in it")
+        self._stream = stream
+        self._clock = clock
+        stream.log(IMAGE, asset, static=True)
+        stream.log(
+            IMAGE,
+            rr.VideoFrameReference.from_fields(draw_order=_BEHIND_OVERLAYS),
+            static=True,
+        )
+
+    def log(self, frame: Frame) -> int:
+        self._clock.set(frame.index, frame.time_s)
+        time_ns = self._nearest(frame.time_s)
+        self._stream.log(IMAGE, rr.VideoFrameReference.from_fields(timestamp=time_ns))
+        return 0
+
+    def close(self) -> None:
+        pass
+
+    def _nearest(self, time_s: float) -> int:
+        """The file's own time of the picture that is ``time_s`` after its first."""
+        wanted = round(time_s * 1e9) + int(self._times_ns[0])
+        right = int(np.searchsorted(self._times_ns, wanted))
+        around = self._times_ns[max(right - 1, 0) : right + 1]
+        return int(around[np.argmin(np.abs(around - wanted))])

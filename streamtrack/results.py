@@ -1,0 +1,325 @@
+"""Writers of results as files: they watch the Steps go by and never decide anything.
+
+    CSV, JSON Lines, MOT text, poses    a record is on its way to the disk when `write` returns, so
+                                        a killed process loses nothing; a record that a full disk
+                                        cut in half is taken back
+    Parquet                             row groups of 65 536 rows; readable only once closed
+
+All of them are context managers that leave a complete file, whatever ended the run. Files are
+opened (and emptied), and missing folders made, in the constructor: what cannot be written is
+known before the first frame. What goes wrong is an `OutputError` of one line.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import math
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Protocol, Self
+
+import numpy as np
+
+from streamtrack.errors import UsageError
+from streamtrack.geometry import bounding_box
+from streamtrack.outputs import Closing, RecordFile, open_output, output_error
+from streamtrack.types import Skipped, Step, Track
+
+_BATCH_ROWS = 1024
+_GROUP_BATCHES = 64
+
+
+class TrackRow(NamedTuple):
+    """One target in one frame, in the order of the columns of CSV, JSON Lines and Parquet.
+
+    Corners x1, y1 .. x4, y4 in full-resolution pixels, ``model`` and ``rmse_px`` are None unless
+    the state is tracking (``rmse_px`` also where it was not estimated).
+    """
+
+    frame: int
+    time_s: float | None
+    target: str
+    state: str
+    x1: float | None
+    y1: float | None
+    x2: float | None
+    y2: float | None
+    x3: float | None
+    y3: float | None
+    x4: float | None
+    y4: float | None
+    model: str | None
+    matches: int
+    inliers: int
+    rmse_px: float | None
+
+
+TRACK_COLUMNS = TrackRow._fields
+POSE_COLUMNS = (
+    *("frame", "name", "time_s", "status", "reason"),
+    *(f"h{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)),
+)
+_DECIMALS = dict.fromkeys(TRACK_COLUMNS[4:12], 3) | {"time_s": 6, "rmse_px": 4}
+
+
+def track_rows(step: Step) -> list[TrackRow]:
+    """The rows of one frame, one a target, in the order of ``step.tracks``."""
+    return [_track_row(step, track) for track in step.tracks]
+
+
+def _track_row(step: Step, track: Track) -> TrackRow:
+    quad = _finite_quad(track)
+    corners: list[float | None] = [None] * 8 if quad is None else [*quad]
+    x1, y1, x2, y2, x3, y3, x4, y4 = corners
+    return TrackRow(
+        step.frame.index,
+        _finite(step.frame.time_s),
+        _encodable(track.name),
+        track.state.value,
+        *(x1, y1, x2, y2, x3, y3, x4, y4),
+        None if quad is None or track.model is None else track.model.value,
+        len(track.evidence),
+        track.evidence.inliers,
+        None if quad is None else _finite(track.rmse_px),
+    )
+
+
+def _finite_quad(track: Track) -> list[float] | None:
+    if track.quad is None or not np.isfinite(track.quad).all():
+        return None
+    return [float(value) for value in track.quad.ravel()]
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _encodable(text: str) -> str:
+    """The text without lone surrogates (undecodable bytes of file names), which no format holds."""
+    return text.encode("utf-8", "replace").decode("utf-8")
+
+
+def _csv_line(cells: Iterable[str]) -> str:
+    r"""One line of CSV ending in ``\n``, line breaks within cells quoted.
+
+    The csv module of Python < 3.13 quotes only the breaks of its own line ending, hence the detour.
+    """
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\r\n").writerow(cells)
+    return buffer.getvalue().removesuffix("\r\n") + "\n"
+
+
+def _csv_cell(column: str, value: str | float | None) -> str:
+    if value is None:
+        return ""
+    return f"{value:z.{_DECIMALS[column]}f}" if column in _DECIMALS else str(value)
+
+
+def _csv_lines(step: Step) -> str:
+    return "".join(
+        _csv_line(
+            _csv_cell(column, value) for column, value in zip(TRACK_COLUMNS, row, strict=True)
+        )
+        for row in track_rows(step)
+    )
+
+
+def _json_value(column: str, value: str | float | None) -> str | float | None:
+    return round(value, _DECIMALS[column]) if isinstance(value, float) else value
+
+
+def _json_lines(step: Step) -> str:
+    records = (
+        {column: _json_value(column, value) for column, value in row._asdict().items()}
+        for row in track_rows(step)
+    )
+    return "".join(
+        json.dumps(record, ensure_ascii=False, allow_nan=False) + "\n" for record in records
+    )
+
+
+class _MotLines:
+    """Lines of MOT Challenge text, for the targets that are tracked.
+
+    ``frame,id,bb_left,bb_top,bb_width,bb_height,conf,-1,-1,-1``: frames count from 1, ids from 1 in
+    the order in which targets first appear, conf is 1. The box is the axis-aligned bounding box of
+    the quad, in the same pixels as everywhere else: (0, 0) is the centre of the top-left pixel.
+    """
+
+    def __init__(self) -> None:
+        self._ids: dict[str, int] = {}
+
+    def __call__(self, step: Step) -> str:
+        lines = []
+        for track in step.tracks:
+            target = self._ids.setdefault(track.name, len(self._ids) + 1)
+            quad = _finite_quad(track)
+            if quad is not None:
+                x0, y0, x1, y1 = bounding_box(quad)
+                box = ",".join(f"{value:z.3f}" for value in (x0, y0, x1 - x0, y1 - y0))
+                lines.append(f"{step.frame.index + 1},{target},{box},1,-1,-1,-1\n")
+        return "".join(lines)
+
+
+class TracksWriter(Protocol):
+    """A file of tracks, written one Step at a time; leaving the context closes it."""
+
+    def write(self, step: Step) -> None:
+        """Add the rows of one frame. Raises OutputError."""
+        ...
+
+    def close(self) -> None:
+        """Complete the file; further calls do nothing. Raises OutputError."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None: ...
+
+
+class _TextTracksWriter(RecordFile):
+    def __init__(self, path: Path, header: str, lines_of: Callable[[Step], str]) -> None:
+        super().__init__(path, header)
+        self._lines_of = lines_of
+
+    def write(self, step: Step) -> None:
+        self.append(self._lines_of(step))
+
+
+class _ParquetTracksWriter(Closing):
+    """Rows wait as compact batches until they fill a row group: memory stays flat for weeks."""
+
+    def __init__(self, path: Path) -> None:
+        import pyarrow.parquet
+
+        self._path = path
+        self._schema = _parquet_schema()
+        self._rows: list[TrackRow] = []
+        self._batches: list[Any] = []
+        self._file = io.BufferedWriter(open_output(path))
+        self._writer: Any = pyarrow.parquet.ParquetWriter(
+            self._file, self._schema, compression="zstd"
+        )
+
+    def write(self, step: Step) -> None:
+        if self._file.closed:
+            raise ValueError(f"{self._path} is closed")
+        self._rows += track_rows(step)
+        if len(self._rows) >= _BATCH_ROWS:
+            self._end_batch()
+        if len(self._batches) >= _GROUP_BATCHES:
+            try:
+                self._end_group()
+            except OSError as error:
+                self._abandon()
+                raise output_error(self._path, error) from None
+
+    def close(self) -> None:
+        if self._file.closed:
+            return
+        try:
+            self._end_batch()
+            self._end_group()
+            self._writer.close()
+            self._file.close()
+        except OSError as error:
+            self._abandon()
+            raise output_error(self._path, error) from None
+
+    def _end_batch(self) -> None:
+        import pyarrow as pa
+
+        if not self._rows:
+            return
+        columns = zip(zip(*self._rows, strict=True), self._schema, strict=True)
+        arrays = [pa.array(column, field.type) for column, field in columns]
+        self._batches.append(pa.record_batch(arrays, schema=self._schema))
+        self._rows.clear()
+
+    def _end_group(self) -> None:
+        import pyarrow as pa
+
+        if self._batches:
+            table = pa.Table.from_batches(self._batches, self._schema)
+            self._writer.write_table(table, row_group_size=table.num_rows)
+            self._batches.clear()
+
+    def _abandon(self) -> None:
+        """Let go of a file that took no more: without this pyarrow tries again when collected."""
+        self._writer.is_open = False
+        with contextlib.suppress(OSError):
+            self._file.close()
+
+
+def _parquet_schema() -> Any:
+    import pyarrow as pa
+
+    types = {"frame": pa.int64(), "time_s": pa.float64(), "matches": pa.int32()}
+    types |= {"inliers": pa.int32()} | dict.fromkeys(("target", "state", "model"), pa.string())
+    return pa.schema([(column, types.get(column, pa.float32())) for column in TRACK_COLUMNS])
+
+
+_OPENERS: dict[str, Callable[[Path], TracksWriter]] = {
+    ".csv": lambda path: _TextTracksWriter(path, _csv_line(TRACK_COLUMNS), _csv_lines),
+    ".jsonl": lambda path: _TextTracksWriter(path, "", _json_lines),
+    ".parquet": _ParquetTracksWriter,
+    ".txt": lambda path: _TextTracksWriter(path, "", _MotLines()),
+}
+
+
+def check_tracks_path(path: Path) -> None:
+    """Raise UsageError unless the ending of ``path`` names a format of tracks."""
+    if path.suffix.lower() not in _OPENERS:
+        raise UsageError(
+            f"no format of tracks belongs to the ending of '{path}': "
+            f"known are {', '.join(_OPENERS)} (MOT Challenge)"
+        )
+
+
+def open_tracks_writer(path: Path) -> TracksWriter:
+    """A writer of tracks in the format of the file's ending, ready to be written to.
+
+    An existing file is replaced. Raises UsageError for an unknown ending, OutputError if the file
+    cannot be written.
+    """
+    check_tracks_path(path)
+    return _OPENERS[path.suffix.lower()](path)
+
+
+class PosesWriter(RecordFile):
+    """CSV of camera poses: ``world_from_frame`` row by row, in full precision.
+
+    Status is ``used``, or ``skipped`` with a reason and no matrix where the pose is not known.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, _csv_line(POSE_COLUMNS))
+
+    def write(self, step: Step) -> None:
+        """Add the pose of one frame. Raises OutputError."""
+        frame, pose = step.frame, step.camera.world_from_frame
+        time_s = _csv_cell("time_s", _finite(frame.time_s))
+        if pose is None:
+            self._add(frame.index, frame.name, time_s, "skipped", step.camera.reason, [""] * 9)
+        else:
+            elements = [str(float(value)) for value in pose.ravel()]
+            self._add(frame.index, frame.name, time_s, "used", "", elements)
+
+    def write_skipped(self, skipped: Skipped) -> None:
+        """Add a picture that the source left out; its time is not known. Raises OutputError."""
+        self._add(skipped.index, skipped.name, "", "skipped", skipped.reason, [""] * 9)
+
+    def _add(
+        self, index: int, name: str, time_s: str, status: str, reason: str, elements: list[str]
+    ) -> None:
+        cells = (str(index), _encodable(name), time_s, status, _encodable(reason), *elements)
+        self.append(_csv_line(cells))

@@ -1,0 +1,1 @@
+"""Painters: textures drawn from seeded random numbers, and the scenes made of them."""

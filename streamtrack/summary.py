@@ -1,0 +1,326 @@
+"""The summary of a tracking run, gathered in constant memory while the Steps go by.
+
+Names are those of the ancestor's front panel: detector, threshold, descriptor, features, matches,
+inliers, transformation model. Definitions:
+
+    features       keypoints a frame, mean over the frames in which any detection ran
+    matches        point pairs behind a track (its evidence), over all tracked target-frames
+    inliers        those of them that agree with the estimate
+    rmse_px        mean over the tracked frames of the inliers' RMS transfer error
+    losses         changes from tracking to lost
+    ms_per_frame   wall time of a frame, its stages together; quantiles are nearest-rank, from
+                   bins 1 % wide, so right to 0.5 %; ``by_stage`` is the mean over all frames
+    time_s, fps    wall time since the builder was made, and frames over it (waiting for a live
+                   source included)
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from streamtrack.meters import LogHistogram, Mean, nearest_rank, peak_rss_mb
+from streamtrack.outputs import write_file
+from streamtrack.settings import Settings
+from streamtrack.types import Size, Skipped, SourceInfo, Step, Track, TrackState
+
+
+@dataclass(frozen=True, slots=True)
+class TargetSummary:
+    """One target: frames in each state, and means over the frames in which it was tracked.
+
+    ``first_seen`` is the index of the first frame in which it was tracked, ``models`` counts
+    frames a transformation model. What was never measured is None.
+    """
+
+    name: str
+    frames_tracked: int
+    frames_lost: int
+    frames_searching: int
+    losses: int
+    first_seen: int | None
+    rmse_px: float | None
+    matches: float | None
+    inliers: float | None
+    models: dict[str, int]
+
+    @property
+    def share(self) -> float:
+        """Share (0..1) of the frames since the target was given in which it was tracked."""
+        frames = self.frames_tracked + self.frames_lost + self.frames_searching
+        return self.frames_tracked / frames if frames else 0.0
+
+    def to_text(self) -> str:
+        """All of it in one line."""
+        frames = self.frames_tracked + self.frames_lost + self.frames_searching
+        seen = "never seen" if self.first_seen is None else f"first seen in frame {self.first_seen}"
+        return (
+            f"tracked {self.frames_tracked} of {frames} ({self.share:.1%}), "
+            f"lost {self.frames_lost}, searching {self.frames_searching}, "
+            f"losses {self.losses}, {seen}, RMSE {_number(self.rmse_px, 2, ' px')}"
+        )
+
+
+@dataclass(slots=True)
+class _TargetSums:
+    name: str
+    states: Counter[TrackState] = field(default_factory=Counter)
+    losses: int = 0
+    last: TrackState | None = None
+    first_seen: int | None = None
+    rmse_px: Mean = field(default_factory=Mean)
+    matches: Mean = field(default_factory=Mean)
+    inliers: Mean = field(default_factory=Mean)
+    models: Counter[str] = field(default_factory=Counter)
+
+    def add(self, track: Track, frame: int) -> None:
+        self.states[track.state] += 1
+        self.losses += self.last is TrackState.TRACKING and track.state is TrackState.LOST
+        self.last = track.state
+        if track.state is not TrackState.TRACKING:
+            return
+        if self.first_seen is None:
+            self.first_seen = frame
+        self.rmse_px.add(track.rmse_px)
+        self.matches.add(len(track.evidence))
+        self.inliers.add(track.evidence.inliers)
+        if track.model is not None:
+            self.models[track.model.value] += 1
+
+    def build(self) -> TargetSummary:
+        return TargetSummary(
+            self.name,
+            self.states[TrackState.TRACKING],
+            self.states[TrackState.LOST],
+            self.states[TrackState.SEARCHING],
+            self.losses,
+            self.first_seen,
+            self.rmse_px.value,
+            self.matches.value,
+            self.inliers.value,
+            dict(self.models.most_common()),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What a run was, did and cost; definitions at the top of the module. Unknown is None."""
+
+    source: str
+    size_wh: Size
+    settings: Settings
+    frames: int
+    frames_with_pose: int
+    features: float | None
+    matches: float | None
+    matches_median: int | None
+    inliers: float | None
+    targets: tuple[TargetSummary, ...]
+    ms_median: float | None
+    ms_p95: float | None
+    ms_by_stage: dict[str, float]
+    time_s: float
+    peak_rss_mb: float
+    skipped: tuple[Skipped, ...]
+    corrupt_packets: int
+    ended: str
+
+    @property
+    def fps(self) -> float | None:
+        """Frames over wall time; None if there were none."""
+        return self.frames / self.time_s if self.frames and self.time_s > 0 else None
+
+    @property
+    def models(self) -> dict[str, int]:
+        """How many target-frames each transformation model was used for, most used first."""
+        counts: Counter[str] = Counter()
+        for target in self.targets:
+            counts.update(target.models)
+        return dict(counts.most_common())
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values under the names of the contract, null for what is unknown, never NaN.
+
+        ``warping`` and ``blending`` are null: they belong to the summary of a mosaic.
+        """
+        features = self.settings.features
+        has_threshold = features.threshold is not None and math.isfinite(features.threshold)
+        return {
+            "source": self.source,
+            "size": {"width": self.size_wh[0], "height": self.size_wh[1]},
+            "frames": self.frames,
+            "detector": features.detector,
+            "threshold": features.threshold if has_threshold else None,
+            "descriptor": features.descriptor,
+            "transformation_model": self.settings.registration.model,
+            "warping": None,
+            "blending": None,
+            "method": self.settings.tracker.method,
+            "camera": self.settings.camera,
+            "frames_with_pose": self.frames_with_pose,
+            "features": self.features,
+            "matches": {"mean": self.matches, "median": self.matches_median},
+            "inliers": self.inliers,
+            "models": self.models,
+            "targets": [_target_json(target) for target in self.targets],
+            "ms_per_frame": {
+                "median": self.ms_median,
+                "p95": self.ms_p95,
+                "by_stage": self.ms_by_stage,
+            },
+            "fps": self.fps,
+            "time_s": self.time_s,
+            "peak_rss_mb": self.peak_rss_mb,
+            "skipped": [
+                {"frame": item.index, "name": item.name, "reason": item.reason}
+                for item in self.skipped
+            ],
+            "corrupt_packets": self.corrupt_packets,
+            "ended": self.ended,
+        }
+
+    def rows(self) -> list[tuple[str, str]]:
+        """(label, value) pairs for a table. Names are verbatim: escape them for markup."""
+        features = self.settings.features
+        threshold = "default" if features.threshold is None else f"{features.threshold:g}"
+        used = ", ".join(f"{model} {count}" for model, count in self.models.items())
+        matches = f"mean {_number(self.matches, 1)}, median {_number(self.matches_median, 0)}"
+        ms = f"median {_number(self.ms_median, 1)} ms, p95 {_number(self.ms_p95, 1)} ms"
+        return [
+            ("Source", f"{self.source}, {self.size_wh[0]}x{self.size_wh[1]}"),
+            ("Detector", features.detector),
+            ("Threshold", threshold),
+            ("Descriptor", features.descriptor),
+            ("Features", _number(self.features, 0, " a frame")),
+            ("Matches", matches),
+            ("Inliers", _number(self.inliers, 1)),
+            ("Transformation model", used or self.settings.registration.model),
+            ("Camera", f"{self.settings.camera}, known in {self.frames_with_pose} frames"),
+            ("Frames", str(self.frames)),
+            *((f"Target {target.name}", target.to_text()) for target in self.targets),
+            ("Time a frame", f"{ms}, {_number(self.fps, 1)} frames a second"),
+            ("Peak memory", f"{self.peak_rss_mb:.0f} MB"),
+            ("Corrupt packets", str(self.corrupt_packets)),
+            ("Skipped pictures", str(len(self.skipped))),
+            ("Ended", self.ended),
+        ]
+
+    def to_markdown(self) -> str:
+        """The table, and a list of the pictures that were left out."""
+        lines = ["# Tracking summary", "", "| what | value |", "|---|---|"]
+        lines += [f"| {_cell(label)} | {_cell(value)} |" for label, value in self.rows()]
+        if self.skipped:
+            lines += ["", "## Skipped pictures", "", "| frame | name | reason |", "|---|---|---|"]
+            lines += [
+                f"| {item.index} | {_cell(item.name)} | {_cell(item.reason)} |"
+                for item in self.skipped
+            ]
+        return "\n".join(lines) + "\n"
+
+    def write_json(self, path: Path) -> None:
+        """Write `to_json` as a whole file or not at all. Raises OutputError."""
+        text = json.dumps(self.to_json(), indent=2, ensure_ascii=False, allow_nan=False)
+        write_file(path, (text + "\n").encode("utf-8", "replace"))
+
+
+def _target_json(target: TargetSummary) -> dict[str, Any]:
+    return {
+        "name": target.name,
+        "frames_tracked": target.frames_tracked,
+        "frames_lost": target.frames_lost,
+        "frames_searching": target.frames_searching,
+        "share": target.share,
+        "first_seen": target.first_seen,
+        "losses": target.losses,
+        "rmse_px": target.rmse_px,
+        "matches": target.matches,
+        "inliers": target.inliers,
+        "models": target.models,
+    }
+
+
+def _number(value: float | None, decimals: int, unit: str = "") -> str:
+    return "-" if value is None else f"{value:.{decimals}f}{unit}"
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;")
+
+
+class SummaryBuilder:
+    """Running sums over Steps; memory does not grow with the number of frames.
+
+    ``clock`` gives wall seconds. Targets may appear at any time.
+    """
+
+    def __init__(
+        self,
+        source: SourceInfo,
+        settings: Settings,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self._source = source
+        self._settings = settings
+        self._clock = clock
+        self._started = clock()
+        self._frames = 0
+        self._frames_with_pose = 0
+        self._features, self._inliers = Mean(), Mean()
+        self._match_counts: Counter[int] = Counter()
+        self._targets: dict[str, _TargetSums] = {}
+        self._ms = LogHistogram()
+        self._stage_ms: dict[str, float] = {}
+
+    def add(self, step: Step) -> None:
+        """Take in one frame."""
+        self._frames += 1
+        self._frames_with_pose += step.camera.world_from_frame is not None
+        if step.features is not None:
+            self._features.add(len(step.features))
+        for track in step.tracks:
+            self._add_track(track, step.frame.index)
+        self._add_times(step.stage_ms)
+
+    def _add_track(self, track: Track, frame: int) -> None:
+        self._targets.setdefault(track.name, _TargetSums(track.name)).add(track, frame)
+        if track.state is TrackState.TRACKING:
+            self._match_counts[len(track.evidence)] += 1
+            self._inliers.add(track.evidence.inliers)
+
+    def _add_times(self, stage_ms: dict[str, float]) -> None:
+        stages = {name: ms for name, ms in stage_ms.items() if name != "total"}
+        self._ms.add(stage_ms.get("total", sum(stages.values())))
+        for name, ms in stages.items():
+            if math.isfinite(ms):
+                self._stage_ms[name] = self._stage_ms.get(name, 0.0) + ms
+
+    def build(self, skipped: Sequence[Skipped], corrupt_packets: int, ended: str) -> Summary:
+        """The summary so far; ``ended`` says in words why the run ended."""
+        counts = self._match_counts
+        pairs = sum(matches * times for matches, times in counts.items())
+        return Summary(
+            source=self._source.name,
+            size_wh=self._source.size_wh,
+            settings=self._settings,
+            frames=self._frames,
+            frames_with_pose=self._frames_with_pose,
+            features=self._features.value,
+            matches=pairs / counts.total() if counts else None,
+            matches_median=nearest_rank(counts, 0.5),
+            inliers=self._inliers.value,
+            targets=tuple(target.build() for target in self._targets.values()),
+            ms_median=self._ms.quantile(0.5),
+            ms_p95=self._ms.quantile(0.95),
+            ms_by_stage={name: ms / self._frames for name, ms in self._stage_ms.items()},
+            time_s=self._clock() - self._started,
+            peak_rss_mb=peak_rss_mb(),
+            skipped=tuple(skipped),
+            corrupt_packets=corrupt_packets,
+            ended=ended,
+        )

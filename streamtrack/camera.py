@@ -19,7 +19,7 @@ from streamtrack.matching import match
 from streamtrack.registration import register
 from streamtrack.settings import Settings
 from streamtrack.types import CameraPose, Features, Matrix, Registration, Track, Verdict
-from streamtrack.view import FrameView
+from streamtrack.frame_view import FrameView
 
 _MIN_OVERLAP = 0.6
 _MIN_KEYFRAME_INLIERS = 60

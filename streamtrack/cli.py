@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -34,9 +35,14 @@ _DESCRIPTORS = "freak, brisk, orb, teblid, sift, akaze"
 
 
 def main() -> None:
-    """Run the program; exit code 0 if all is done, 2 for wrong usage, 1 for any failure."""
+    """Run the program."""
+    exit_on_error(app)
+
+
+def exit_on_error(run: Callable[[], Any]) -> None:
+    """Call ``run``; exit with 2 for wrong usage and 1 for any failure, each said in one line."""
     try:
-        app(standalone_mode=True)
+        run()
     except UsageError as error:
         _fail(error, 2)
     except StreamtrackError as error:
@@ -273,3 +279,7 @@ class _StopOnSignal:
         if self._came:
             raise KeyboardInterrupt
         self._came = True
+
+
+if __name__ == "__main__":
+    main()

@@ -19,7 +19,7 @@ from streamtrack.registration import refused, register
 from streamtrack.settings import RegistrationSettings
 from streamtrack.template import Patch, Template
 from streamtrack.types import Image, Mask, Matrix, Points, Registration, Verdict
-from streamtrack.view import FrameView, level_from_frame
+from streamtrack.frame_view import FrameView, level_from_frame
 
 Floats = npt.NDArray[np.float32]
 

@@ -18,7 +18,7 @@ from streamtrack.targets import Target, check_quad_in_picture
 from streamtrack.template import make_template
 from streamtrack.tracker import DetectTracker, HybridTracker, TargetTracker
 from streamtrack.types import Step, Track
-from streamtrack.view import FrameView
+from streamtrack.frame_view import FrameView
 
 
 def track(

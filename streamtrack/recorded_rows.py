@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import rerun as rr
-from rerun._baseclasses import AsComponents, ComponentDescriptor
 
 from streamtrack.types import Points
 
@@ -34,7 +33,7 @@ class _Column:
         return self._array
 
 
-def _descriptors(archetype: AsComponents) -> list[ComponentDescriptor]:
+def _descriptors(archetype: rr.AsComponents) -> list[rr.ComponentDescriptor]:
     return [batch.component_descriptor() for batch in archetype.as_component_batches()]
 
 
@@ -60,9 +59,7 @@ def points(positions: Points, classes: npt.NDArray[np.uint16] | None = None) -> 
     return row
 
 
-def strips(
-    corners: npt.NDArray[np.float32], classes: npt.NDArray[np.uint16] | None = None
-) -> Row:
+def strips(corners: npt.NDArray[np.float32], classes: npt.NDArray[np.uint16] | None = None) -> Row:
     """Line strips (M, K, 2) of K points each with their class ids (M,)."""
     count, length = corners.shape[:2]
     offsets = pa.array(np.arange(count + 1, dtype=np.int32) * np.int32(length))
@@ -78,5 +75,5 @@ def _xy_array(positions: npt.NDArray[np.float32]) -> pa.Array:
     return pa.FixedSizeListArray.from_arrays(flat, type=_XY)
 
 
-def _batch(array: pa.Array, descriptor: ComponentDescriptor) -> rr.DescribedComponentBatch:
+def _batch(array: pa.Array, descriptor: rr.ComponentDescriptor) -> rr.DescribedComponentBatch:
     return rr.DescribedComponentBatch(_Column(array), descriptor)

@@ -17,6 +17,7 @@ from streamtrack.types import Image, Matrix, Points, Size, Step, Track, TrackSta
 _CLOSE_UP_EVERY = 5
 _CLOSE_UP_SIDE = 160
 _CLOSE_UP_QUALITY = 80
+_BLANK_GREY = 32
 
 
 class TargetLog:
@@ -66,7 +67,7 @@ class TargetLog:
             self._log_close_up(step.frame.image, track)
         elif before is TrackState.TRACKING:
             self._stream.log(self._entities.drawing, rr.Clear(recursive=True))
-            self._stream.log(self._entities.view, rr.Clear(recursive=False))
+            self._log_no_close_up()
         self._log_numbers(track)
         self._frame_from_template = track.frame_from_template
         return message
@@ -105,6 +106,13 @@ class TargetLog:
             self._log_template(close_up)
         self._stream.log(self._entities.view, _jpeg(close_up))
 
+    def _log_no_close_up(self) -> None:
+        """A blank picture, for the viewer goes on showing a cleared one."""
+        if self._box is not None:
+            size_wh, _ = _box_view(self._box)
+            blank = np.full((size_wh[1], size_wh[0]), _BLANK_GREY, np.uint8)
+            self._stream.log(self._entities.view, _jpeg(blank))
+
     def _log_template(self, picture: Image) -> None:
         self._stream.log(self._entities.template, _jpeg(picture), static=True)
 
@@ -119,10 +127,14 @@ def _upright(
     image: Image, template_from_frame: Matrix, box: tuple[float, float, float, float]
 ) -> Image:
     """The part of the frame that shows the template's ``box``, small and as it was given."""
-    x0, y0, x1, y1 = box
-    size, factor = _close_up_size((round(x1 - x0) + 1, round(y1 - y0) + 1))
-    close_up_from_frame = scaling(factor) @ translation(-x0, -y0) @ template_from_frame
+    size, factor = _box_view(box)
+    close_up_from_frame = scaling(factor) @ translation(-box[0], -box[1]) @ template_from_frame
     return np.asarray(cv2.warpPerspective(image, close_up_from_frame, size), np.uint8)
+
+
+def _box_view(box: tuple[float, float, float, float]) -> tuple[Size, float]:
+    x0, y0, x1, y1 = box
+    return _close_up_size((round(x1 - x0) + 1, round(y1 - y0) + 1))
 
 
 def _shrunk(picture: Image) -> Image:

@@ -108,7 +108,7 @@ def _warn_if_ffmpeg_is_missing(codec: str) -> None:
 
 
 class _NoVideo:
-    def log(self, frame: Frame) -> int:  # noqa: ARG002
+    def log(self, frame: Frame) -> int:
         return 0
 
     def close(self) -> None:

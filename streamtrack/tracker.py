@@ -36,7 +36,7 @@ from streamtrack.types import (
     TrackState,
     Verdict,
 )
-from streamtrack.view import FrameView
+from streamtrack.frame_view import FrameView
 
 _GUIDED_RADIUS_PX = 60.0
 _COAST_FRAMES = 10

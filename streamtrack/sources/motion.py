@@ -15,7 +15,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from streamtrack.geometry import translation
+from streamtrack.geometry import normalized, translation
 from streamtrack.types import Matrix, Size
 
 TAU = 2.0 * math.pi
@@ -80,7 +80,7 @@ def homography(pose: Pose, centre_xy: tuple[float, float], size_wh: Size) -> Mat
     camera = np.array([[focal, 0.0, px], [0.0, focal, py], [0.0, 0.0, 1.0]])
     pinhole: Matrix = camera @ np.column_stack([rotation[:, 0], rotation[:, 1], shift])
     matrix: Matrix = pinhole @ translation(-centre_xy[0], -centre_xy[1])
-    return matrix / matrix[2, 2]
+    return normalized(matrix)
 
 
 class Wave:

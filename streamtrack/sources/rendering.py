@@ -1,8 +1,8 @@
 """Pictures of textured planes: warping without aliasing, exact to the hundredth of a pixel.
 
-A `Sprite` is a picture with coverage (premultiplied BGRA) and its mip pyramid. It is warped from the
-level that fits the local scale and, where the plane is seen smaller than painted, onto a grid twice
-as fine which is then averaged, so edges are soft and centres stay where they are.
+A `Sprite` is a picture with coverage (premultiplied BGRA) and its mip pyramid. It is warped from
+the level that fits the local scale and, where the plane is seen smaller than painted, onto a grid
+twice as fine which is then averaged, so edges are soft and centres stay where they are.
 """
 
 from __future__ import annotations

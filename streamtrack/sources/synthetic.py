@@ -5,7 +5,8 @@ same URI always gives the same bytes. Parameters: ``seed``, ``frames``, ``size``
 fraction as 30000/1001), ``noise`` (standard deviation of each channel in grey levels), ``blur``
 (exposure as a share of the time between frames, 0..1), ``light`` (strength of changes of light,
 0..1), ``occluders`` (how many), ``image`` (a picture of yours as the target's texture, or as the
-land of ``flight``), ``texture`` (one of the painted kinds) and, for ``flight``, ``step`` (px a frame).
+land of ``flight``), ``texture`` (one of the painted kinds) and, for ``flight``, ``step`` (px a
+frame).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
@@ -23,7 +25,7 @@ import cv2
 import numpy as np
 
 from streamtrack.errors import UsageError, unknown_name
-from streamtrack.geometry import transform_points
+from streamtrack.geometry import inverted, transform_points
 from streamtrack.sources.motion import stream
 from streamtrack.sources.rendering import Box, Floats, Ground, NoiseBank, laid_over
 from streamtrack.sources.scenes.catalogue import RECIPES, SCENES, TEXTURES, Request, build
@@ -67,9 +69,6 @@ class SyntheticSource:
         self._request = request
         self._rate = rate
         self._next = 0
-        self._noise = NoiseBank(stream(request.seed, "noise"), request.size_wh)
-        backdrop = self.scene.backdrop
-        self._still = None if isinstance(backdrop, Ground) else backdrop.astype(np.float32)
         self._info = SourceInfo(uri, request.size_wh, float(rate), request.frames)
 
     @property
@@ -99,6 +98,16 @@ class SyntheticSource:
         traceback: TracebackType | None,
     ) -> None:
         return None
+
+    @cached_property
+    def _noise(self) -> NoiseBank:
+        return NoiseBank(stream(self._request.seed, "noise"), self._request.size_wh)
+
+    @cached_property
+    def _still(self) -> Floats | None:
+        """The backdrop of a fixed camera, None if the camera travels."""
+        backdrop = self.scene.backdrop()
+        return None if isinstance(backdrop, Ground) else backdrop.astype(np.float32)
 
     def __len__(self) -> int:
         return self._request.frames
@@ -178,7 +187,7 @@ class SyntheticSource:
         if self.scene.frame_from_ground is not None:
             view = self.scene.frame_from_ground
             corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
-            tracked.append((view, transform_points(np.linalg.inv(view(index)), corners)))
+            tracked.append((view, transform_points(inverted(view(index)), corners)))
         for motion, quad in tracked:
             seen = [transform_points(motion(index + d), quad) for d in (-half, 0.0, half)]
             run = np.linalg.norm(seen[1] - seen[0], axis=1)
@@ -192,7 +201,7 @@ class SyntheticSource:
         return bool((high > 0).all() and (low < np.array(self.scene.size_wh)).all())
 
     def _travelled(self, n: float, is_quick: bool) -> Floats:
-        ground, view = self.scene.backdrop, self.scene.frame_from_ground
+        ground, view = self.scene.backdrop(), self.scene.frame_from_ground
         assert isinstance(ground, Ground) and view is not None
         picture: Floats = ground.warped(view(n), self.scene.size_wh).astype(np.float32)
         self._lay(picture, n, (0, 0, *self.scene.size_wh), is_quick)

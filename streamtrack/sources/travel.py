@@ -49,9 +49,10 @@ def mower_lap(length: float, lane_px: float) -> Lap:
     lanes = 2 if length < 5_000 else 4
     lane_px = min(lane_px, length / (4.0 * lanes))
     wanted = length
-    for _ in range(6):
-        lap = _rounded(_mower_corners(wanted, lanes, lane_px))
+    lap = _rounded(_mower_corners(wanted, lanes, lane_px))
+    for _ in range(5):
         wanted *= length / lap.length
+        lap = _rounded(_mower_corners(wanted, lanes, lane_px))
     return Lap(lap.points * (length / lap.length), lap.lengths * (length / lap.length))
 
 

@@ -12,10 +12,13 @@ from streamtrack.types import Image, Size
 
 Colour = tuple[int, int, int]
 Floats = npt.NDArray[np.float32]
-WORDS = tuple(
-    "lorem ipsum dolor sit amet consectetur adipiscing elit sed do eiusmod tempor incididunt ut "
-    "labore et dolore magna aliqua enim ad minim veniam quis nostrud exercitation ullamco laboris "
-    "nisi aliquip ex ea commodo consequat duis aute irure in reprehenderit voluptate velit".split()
+WORDS = (
+    *("lorem", "ipsum", "dolor", "sit", "amet", "consectetur", "adipiscing", "elit"),
+    *("sed", "do", "eiusmod", "tempor", "incididunt", "ut", "labore", "et"),
+    *("dolore", "magna", "aliqua", "enim", "ad", "minim", "veniam", "quis"),
+    *("nostrud", "exercitation", "ullamco", "laboris", "nisi", "aliquip", "ex", "ea"),
+    *("commodo", "consequat", "duis", "aute", "irure", "in", "reprehenderit", "voluptate"),
+    *("velit"),
 )
 
 
@@ -62,16 +65,16 @@ def _smooth_noise(
 
 def tinted(picture: Image, field: Floats, strength: float) -> Image:
     """Brighten and darken by a field (H, W) of -1..1; ``strength`` in grey levels."""
-    changed = picture.astype(np.float32) + strength * field[..., None]
-    return np.clip(changed, 0, 255).astype(np.uint8)
+    change = cv2.cvtColor(np.float32(strength) * field, cv2.COLOR_GRAY2BGR)
+    return np.asarray(cv2.add(picture, change, dtype=cv2.CV_8U), np.uint8)
 
 
 def mixed(base: Image, other: Image | Colour, share: Floats) -> Image:
     """Blend towards another picture or colour by a share (H, W) of 0..1."""
-    weight = np.clip(share, 0.0, 1.0)[..., None]
-    goal = np.asarray(other, np.float32)
-    result: Image = np.rint(base + weight * (goal - base)).astype(np.uint8)
-    return result
+    weight = cv2.cvtColor(np.clip(share, 0.0, 1.0), cv2.COLOR_GRAY2BGR)
+    goal = plain((base.shape[1], base.shape[0]), other) if isinstance(other, tuple) else other
+    change = cv2.multiply(cv2.subtract(goal, base, dtype=cv2.CV_32F), weight)
+    return np.asarray(cv2.add(base, change, dtype=cv2.CV_8U), np.uint8)
 
 
 def varied(rng: np.random.Generator, colour: Colour, spread: int) -> Colour:
@@ -125,21 +128,24 @@ def round_box_points(x: float, y: float, w: float, h: float, radius: float) -> F
     radius = min(radius, w / 2, h / 2)
     arcs = []
     for k, (cx, cy) in enumerate(
-        [(x + w - radius, y + h - radius), (x + radius, y + h - radius)]
-        + [(x + radius, y + radius), (x + w - radius, y + radius)]
+        (
+            (x + w - radius, y + h - radius),
+            (x + radius, y + h - radius),
+            (x + radius, y + radius),
+            (x + w - radius, y + radius),
+        )
     ):
         angle = np.linspace(k, k + 1, 9) * np.pi / 2
         arcs.append(np.column_stack([cx + radius * np.cos(angle), cy + radius * np.sin(angle)]))
     return np.vstack(arcs).astype(np.float32)
 
 
-def turned_box(
-    x: float, y: float, w: float, h: float, angle: float, grow: float = 0.0
-) -> npt.NDArray[np.float64]:
-    """Corners (4, 2) of a box with middle (x, y), turned by ``angle`` rad."""
-    half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (w / 2 + grow, h / 2 + grow)
+def turned_box(middle: npt.ArrayLike, size: npt.ArrayLike, angle: float) -> npt.NDArray[np.float64]:
+    """Corners (4, 2) of a box about ``middle`` (x, y), of ``size`` (w, h), turned by ``angle``."""
+    half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.asarray(size, np.float64) / 2.0
     c, s = np.cos(angle), np.sin(angle)
-    corners: npt.NDArray[np.float64] = half @ np.array([[c, s], [-s, c]]) + (x, y)
+    turned = half @ np.array([[c, s], [-s, c]])
+    corners: npt.NDArray[np.float64] = turned + np.asarray(middle, np.float64)
     return corners
 
 

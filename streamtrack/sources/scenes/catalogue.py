@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache, lru_cache
 
 import cv2
 import numpy as np
 
-from streamtrack.geometry import box_quad, translation
+from streamtrack.geometry import box_quad, normalized, translation
 from streamtrack.sources.motion import (
     Path,
     Reach,
@@ -61,6 +62,11 @@ class Request:
     step: float
 
 
+GENTLY = Reach()
+MOSTLY = Pass(0.6)
+STILL = Reach(0.0, (1.0, 1.0), 0.0, 0.0)
+
+
 @dataclass(frozen=True, slots=True)
 class Recipe:
     """A target before a fixed textured background.
@@ -68,24 +74,23 @@ class Recipe:
     ``share`` is the target's size as a share of the frame; ``passes`` belong to the occluders.
     """
 
-    reach: Reach = Reach()
-    texture: str | None = None
+    reach: Reach = GENTLY
+    textures: tuple[str, ...] = ALTERNATING
     share: float = 0.42
     noise: float = 2.0
     exposure: float = 0.0
     light: float = 0.0
     dimming: float = 1.0
     occluders: int = 0
-    passes: Pass = Pass(0.6)
+    passes: Pass = MOSTLY
     shake: float = 0.0
     beyond: float | None = None
     is_absent: bool = False
     race: float = 0.0
 
 
-STILL = Reach(0.0, (1.0, 1.0), 0.0, 0.0)
 RECIPES: Mapping[str, Recipe] = {
-    "board": Recipe(Reach(0.1, (0.8, 1.2), 25.0, 25.0), "board", exposure=0.1),
+    "board": Recipe(Reach(0.1, (0.8, 1.2), 25.0, 25.0), ("board",), exposure=0.1),
     "scale": Recipe(Reach(0.04, (0.28, 2.0), 6.0, 5.0, period=150.0)),
     "rotation": Recipe(Reach(0.05, (0.95, 1.05), 0.0, 5.0, turns=1.0, period=120.0)),
     "perspective": Recipe(Reach(0.06, (0.9, 1.1), 10.0, 60.0, period=115.0)),
@@ -107,14 +112,14 @@ RECIPES: Mapping[str, Recipe] = {
         occluders=1,
         passes=Pass(1.0, start=40.0, period=130.0, dwell=12.0, travel=34.0),
     ),
-    "weak": Recipe(Reach(0.08, (0.9, 1.1), 12.0, 12.0), "faint"),
-    "repeated": Recipe(Reach(0.08, (0.85, 1.15), 15.0, 15.0), "facade"),
+    "weak": Recipe(Reach(0.08, (0.9, 1.1), 12.0, 12.0), ("faint",)),
+    "repeated": Recipe(Reach(0.08, (0.85, 1.15), 15.0, 15.0), ("facade",)),
     "small": Recipe(Reach(0.2, (0.9, 1.15), 15.0, 12.0), share=40.0),
-    "large": Recipe(Reach(0.05, (0.95, 1.1), 6.0, 8.0), share=0.97),
+    "large": Recipe(Reach(0.05, (0.95, 1.1), 6.0, 8.0), ("map", "board", "box"), share=0.97),
     "lowlight": Recipe(Reach(0.09), noise=6.0, dimming=0.2),
     "fast": Recipe(Reach(0.02, (0.95, 1.05), 8.0, 6.0), share=0.36, race=40.0),
     "static": Recipe(STILL, noise=3.0),
-    "light": Recipe(Reach(0.06, (0.9, 1.1), 10.0, 10.0), light=0.65),
+    "light": Recipe(Reach(0.06, (0.9, 1.1), 10.0, 10.0), light=0.5),
 }
 SCENES = ("board", "car", "flight", *(name for name in RECIPES if name != "board"))
 
@@ -135,8 +140,14 @@ def _chosen(asked: float | None, own: float) -> float:
 def _texture(recipe: Recipe, request: Request) -> Image:
     if request.image is not None:
         return request.image
-    kind = request.texture or recipe.texture or ALTERNATING[request.seed % len(ALTERNATING)]
-    return TEXTURES[kind](stream(request.seed, "texture"))
+    kind = request.texture or recipe.textures[request.seed % len(recipe.textures)]
+    return _painted(kind, request.seed)
+
+
+@lru_cache(maxsize=8)
+def _painted(kind: str, seed: int) -> Image:
+    """A painted texture, not to be written to: many scenes share it."""
+    return TEXTURES[kind](stream(seed, "texture"))
 
 
 def _fitted(picture: Image, limit: Size) -> Image:
@@ -163,12 +174,13 @@ def _before_desk(recipe: Recipe, request: Request) -> Scene:
     picture = _fitted(_texture(recipe, request), (int(detail * limit[0]), int(detail * limit[1])))
     sprite = Sprite(premultiplied(picture), shadow=0.5)
     path = _path(recipe, request, (sprite.size_wh[0] / detail, sprite.size_wh[1] / detail))
+    desk_rng = stream(request.seed, f"desk {request.scene}")
     frame_from_target = _seen(path, sprite.size_wh, size_wh, 1.0 / detail)
     return Scene(
         size_wh=size_wh,
         target_quad=sprite.quad,
         frame_from_target=frame_from_target,
-        backdrop=desk.paint_desk(stream(request.seed, f"desk {request.scene}"), size_wh),
+        backdrop=cache(lambda: desk.paint_desk(desk_rng, size_wh)),
         frame_from_ground=None,
         target=sprite,
         occluders=_occluders(recipe, request, sprite, frame_from_target, detail),
@@ -201,7 +213,7 @@ def _seen(path: Path, texture_wh: Size, size_wh: Size, pixel: float) -> MatrixAt
 
     def frame_from_target(n: float) -> Matrix:
         matrix: Matrix = homography(path(n), (0.0, 0.0), size_wh) @ shrink
-        return matrix / matrix[2, 2]
+        return normalized(matrix)
 
     return frame_from_target
 
@@ -245,24 +257,24 @@ def _car(request: Request) -> Scene:
     reach = math.ceil(1.25 * math.hypot(*size_wh)) + 40
     unit = min(size_wh) / 480.0
     lane_px = max(round(56 * unit), 24)
-    rng = stream(request.seed, "road")
-    ground = roadside.paint_road(rng, max(reach, 4 * lane_px + 400), lane_px, reach)
+    height = max(reach, 4 * lane_px + 400)
+    lane_y = height // 2 + 1.5 * lane_px
     own = stream(request.seed, "texture")
     car = roadside.paint_car(own) if request.image is None else premultiplied(request.image)
-    height, width = car.shape[:2]
-    factor = 1.32 * lane_px * 2.2 / max(width, 2.2 * height)
+    factor = 1.32 * lane_px * 2.2 / max(car.shape[1], 2.2 * car.shape[0])
     fine = min(2.0 * factor, 1.0)
-    size = max(round(width * fine), 2), max(round(height * fine), 2)
+    size = max(round(car.shape[1] * fine), 2), max(round(car.shape[0] * fine), 2)
     sprite = Sprite(np.asarray(cv2.resize(car, size, interpolation=cv2.INTER_AREA), np.uint8), 0.5)
     middle = (size[0] - 1) / 2.0, (size[1] - 1) / 2.0
-    lane_y = ground.picture.shape[0] // 2 + 1.5 * lane_px
     motion = stream(request.seed, "motion")
     plan = drive(motion, size_wh, lane_y, lane_px, middle, factor / fine)
 
     def frame_from_target(n: float) -> Matrix:
         matrix: Matrix = plan.frame_from_ground(n) @ plan.ground_from_car(n)
-        return matrix / matrix[2, 2]
+        return normalized(matrix)
 
+    road_rng = stream(request.seed, "road")
+    ground = cache(lambda: roadside.paint_road(road_rng, height, lane_px, reach))
     return _travelling(request, ground, plan.frame_from_ground, frame_from_target, sprite)
 
 
@@ -272,12 +284,15 @@ def _flight(request: Request) -> Scene:
     view, extent, start = flight_view(rng, request.size_wh, request.frames, request.step)
     half = np.round(np.array([0.1, 0.075]) * min(request.size_wh)) * 1.3
     landmark = box_quad(*(np.round(start) - half), *(2.0 * half))
-    if request.image is None:
+
+    @cache
+    def ground() -> Ground:
+        if request.image is not None:
+            return Ground(_filling(request.image, extent))
         paints = stream(request.seed, "texture")
-        land = terrain.paint_terrain(paints, extent, landmark.astype(np.float64))
-    else:
-        land = _filling(request.image, extent)
-    return _travelling(request, Ground(land), view, view, landmark)
+        return Ground(terrain.paint_terrain(paints, extent, landmark.astype(np.float64)))
+
+    return _travelling(request, ground, view, view, landmark)
 
 
 def _filling(picture: Image, extent: Size) -> Image:
@@ -291,7 +306,7 @@ def _filling(picture: Image, extent: Size) -> Image:
 
 
 def _travelling(
-    request: Request, ground: Ground, view: MatrixAt, frame_from_target: MatrixAt,
+    request: Request, ground: Callable[[], Ground], view: MatrixAt, frame_from_target: MatrixAt,
     target: Sprite | Points,
 ) -> Scene:  # fmt: skip
     """A moving camera; the target is a sprite of its own or a quad on the ground."""

@@ -158,7 +158,7 @@ def _chip(board: Image, plan: _Plan, area: Area) -> None:
         for py in np.arange(y + 7, y + h - 8, 12):
             for px in (x - 11, x + w):
                 box(board, px, py, 11, 6, SOLDER)
-    body = turned_box(x + w / 2, y + h / 2, w, h, 0.0)
+    body = turned_box((x + w / 2, y + h / 2), (w, h), 0.0)
     soft_shadow(board, body, 4, 0.6, (4, 5))
     shape(board, body, varied(plan.rng, PACKAGE, 6))
     stroke(board, body[[3, 0, 1]], (86, 84, 82), 3)
@@ -173,7 +173,7 @@ def _chip(board: Image, plan: _Plan, area: Area) -> None:
 def _can(board: Image, plan: _Plan, area: Area) -> None:
     """An electrolytic capacitor seen from above."""
     x, y, radius = area[0] + area[2] / 2, area[1] + area[3] / 2, area[2] / 2 - 3
-    soft_shadow(board, turned_box(x, y, 1.5 * radius, 1.5 * radius, 0.0), 5, 0.6, (5, 6))
+    soft_shadow(board, turned_box((x, y), (1.5 * radius, 1.5 * radius), 0.0), 5, 0.6, (5, 6))
     box(board, x - radius, y - radius, 2 * radius, 2 * radius, (34, 32, 30))
     disc(board, x, y, radius - 1, (206, 208, 206))
     disc(board, x, y, radius - 4, (178, 180, 180))
@@ -185,7 +185,7 @@ def _can(board: Image, plan: _Plan, area: Area) -> None:
 
 def _crystal(board: Image, plan: _Plan, area: Area) -> None:
     x, y, w, h = area[0] + 4, area[1] + 8, area[2] - 8, area[3] - 16
-    body = turned_box(x + w / 2, y + h / 2, w, h, 0.0)
+    body = turned_box((x + w / 2, y + h / 2), (w, h), 0.0)
     soft_shadow(board, body, 4, 0.5, (3, 5))
     shape(board, body, (168, 172, 174))
     stroke(board, body[[3, 0, 1]], (226, 228, 228), 3)

@@ -23,7 +23,7 @@ from streamtrack.sources.scenes.canvas import (
     varied,
     write,
 )
-from streamtrack.sources.scenes.prints import paint_book, paint_page
+from streamtrack.sources.scenes.prints import paint_book, paint_letter
 from streamtrack.types import Image, Size
 
 CANVAS_WIDTH = 1280
@@ -99,29 +99,35 @@ def _spot(desk: Image, rng: np.random.Generator) -> tuple[float, float]:
 
 
 def _sheet(desk: Image, rng: np.random.Generator) -> None:
-    """A printed page or a book, laid down at an angle."""
-    print_ = paint_book(rng) if rng.random() < 0.5 else paint_page(rng)
+    """A book or a letter, laid down at an angle."""
+    print_ = paint_book(rng) if rng.random() < 0.6 else paint_letter(rng)
     height, width = print_.shape[:2]
-    lying = turned_box(*_spot(desk, rng), 0.5 * width, 0.5 * height, rng.uniform(-0.6, 0.6))
+    lying = turned_box(_spot(desk, rng), (0.5 * width, 0.5 * height), rng.uniform(-0.6, 0.6))
     soft_shadow(desk, lying, 9, 0.5, (7, 9))
     small = cv2.resize(print_, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
     corners = np.array([[0, 0], [width, 0], [width, height]], np.float32) / 2 - 0.5
-    matrix = cv2.getAffineTransform(corners, lying[:3].astype(np.float32))
-    size = desk.shape[1], desk.shape[0]
+    low = np.maximum(np.floor(lying.min(axis=0)), 0).astype(int) - (2, 2)
+    low = np.maximum(low, 0)
+    high = np.ceil(lying.max(axis=0)).astype(int) + 3
+    part = desk[low[1] : max(high[1], 0), low[0] : max(high[0], 0)]
+    if part.size == 0:
+        return
+    matrix = cv2.getAffineTransform(corners, (lying[:3] - low).astype(np.float32))
+    size = part.shape[1], part.shape[0]
     cover = np.full(small.shape[:2], 255, np.uint8)
     share = cv2.warpAffine(cover, matrix, size).astype(np.float32) / 255.0
     warped = cv2.warpAffine(small, matrix, size, borderMode=cv2.BORDER_REPLICATE)
-    desk[:] = mixed(desk, np.asarray(warped, np.uint8), share)
+    part[:] = mixed(part, np.asarray(warped, np.uint8), share)
 
 
 def _pens(desk: Image, rng: np.random.Generator) -> None:
     x, y = _spot(desk, rng)
     angle, colour = rng.uniform(0, np.pi), varied(rng, (60, 60, 150), 60)
     along = np.array([np.cos(angle), np.sin(angle)])
-    body = turned_box(x, y, 250, 17, angle)
+    body = turned_box((x, y), (250, 17), angle)
     soft_shadow(desk, body, 5, 0.5, (5, 7))
     shape(desk, body, colour)
-    shape(desk, turned_box(x, y, 250, 5, angle), shade(colour, 1.6))
+    shape(desk, turned_box((x, y), (250, 5), angle), shade(colour, 1.6))
     middle = np.array([x, y])
     tip = [body[1], middle + along * 158, body[2]]
     shape(desk, tip, (150, 192, 222))
@@ -130,13 +136,13 @@ def _pens(desk: Image, rng: np.random.Generator) -> None:
         [middle + along * 148 + (-3, -3), middle + along * 158, middle + along * 148],
         (30, 30, 30),
     )
-    shape(desk, turned_box(*(middle - along * 116), 22, 18, angle), (180, 186, 190))
+    shape(desk, turned_box(middle - along * 116, (22, 18), angle), (180, 186, 190))
 
 
 def _ruler(desk: Image, rng: np.random.Generator) -> None:
     x, y = _spot(desk, rng)
     angle = rng.uniform(0, np.pi)
-    body = turned_box(x, y, 430, 52, angle)
+    body = turned_box((x, y), (430, 52), angle)
     soft_shadow(desk, body, 5, 0.45, (4, 6))
     shape(desk, body, (196, 206, 208))
     along, across = (body[1] - body[0]) / 430, (body[3] - body[0]) / 52
@@ -152,7 +158,7 @@ def _cup(desk: Image, rng: np.random.Generator) -> None:
     rim = np.column_stack([x + 76 * np.cos(around), y + 76 * np.sin(around)])
     soft_shadow(desk, rim, 12, 0.55, (12, 14))
     colour = varied(rng, (206, 198, 190), 30)
-    shape(desk, turned_box(x + 84, y, 46, 24, 0.3), shade(colour, 0.85))
+    shape(desk, turned_box((x + 84, y), (46, 24), 0.3), shade(colour, 0.85))
     for radius, tone in ((78, colour), (68, shade(colour, 0.7)), (62, (26, 44, 70))):
         disc(desk, x, y, radius, tone)
     cv2.ellipse(desk, (round(x), round(y)), (46, 46), 20, 0, 70, (60, 92, 130), 4, cv2.LINE_AA)
@@ -162,11 +168,11 @@ def _screws(desk: Image, rng: np.random.Generator) -> None:
     x, y = _spot(desk, rng)
     for at in rng.normal((x, y), 66, (12, 2)):
         angle = rng.uniform(0, np.pi)
-        soft_shadow(desk, turned_box(*at, 22, 22, angle), 3, 0.5, (3, 4))
-        disc(desk, *at, 13, (150, 158, 162))
+        soft_shadow(desk, turned_box(at, (22, 22), angle), 3, 0.5, (3, 4))
+        disc(desk, at[0], at[1], 13, (150, 158, 162))
         disc(desk, at[0] - 1, at[1] - 1, 10, (192, 198, 200))
-        shape(desk, turned_box(*at, 16, 4, angle), (70, 74, 78))
-        shape(desk, turned_box(*at, 4, 16, angle), (70, 74, 78))
+        shape(desk, turned_box(at, (16, 4), angle), (70, 74, 78))
+        shape(desk, turned_box(at, (4, 16), angle), (70, 74, 78))
 
 
 def _crumbs(desk: Image, rng: np.random.Generator) -> None:
@@ -174,9 +180,9 @@ def _crumbs(desk: Image, rng: np.random.Generator) -> None:
     height, width = desk.shape[:2]
     for x, y in rng.uniform((0, 0), (width, height), (150, 2)):
         size = rng.uniform(3, 13, 2)
-        snippet = turned_box(x, y, *size, rng.uniform(0, np.pi))
+        snippet = turned_box((x, y), size, rng.uniform(0, np.pi))
         soft_shadow(desk, snippet, 2, 0.4, (2, 2))
-        shape(desk, snippet, varied(rng, (140, 160, 170), 80))
+        shape(desk, snippet, varied(rng, (140, 160, 170), 50))
 
 
 def _cable(desk: Image, rng: np.random.Generator) -> None:
@@ -184,14 +190,14 @@ def _cable(desk: Image, rng: np.random.Generator) -> None:
     t = np.linspace(0, 1, 60)
     waves = np.sin(t * rng.uniform(5, 9)) * 90 * t, np.cos(t * rng.uniform(4, 8)) * 80
     course = np.column_stack([x + 500 * (t - 0.5) + waves[1], y + waves[0]])
-    stroke(desk, course + (4, 6), (40, 46, 52), 11)
+    stroke(desk, np.add(course, (4, 6)), (40, 46, 52), 11)
     stroke(desk, course, (36, 34, 34), 10)
-    stroke(desk, course - (1, 2), (92, 90, 90), 3)
+    stroke(desk, np.subtract(course, (1, 2)), (92, 90, 90), 3)
 
 
 def _note(desk: Image, rng: np.random.Generator) -> None:
     x, y = _spot(desk, rng)
-    paper = turned_box(x, y, 130, 130, rng.uniform(-0.5, 0.5))
+    paper = turned_box((x, y), (130, 130), rng.uniform(-0.5, 0.5))
     soft_shadow(desk, paper, 7, 0.4, (5, 8))
     shape(desk, paper, varied(rng, (130, 226, 244), 30))
     right, down = (paper[1] - paper[0]) / 130, (paper[3] - paper[0]) / 130

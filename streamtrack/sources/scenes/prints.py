@@ -89,7 +89,9 @@ def paint_poster(rng: np.random.Generator) -> Image:
         if kind == 0:
             disc(page, at[0], at[1], size, colour)
         elif kind == 1:
-            shape(page, turned_box(at[0], at[1], 2 * size, 0.5 * size, rng.uniform(0, 3)), colour)
+            shape(
+                page, turned_box((at[0], at[1]), (2 * size, 0.5 * size), rng.uniform(0, 3)), colour
+            )
         else:
             ring = (round(at[0]), round(at[1]))
             cv2.circle(page, ring, round(size), colour, 9, cv2.LINE_AA)
@@ -117,7 +119,7 @@ def _barcode(
 
 def paint_box(rng: np.random.Generator) -> Image:
     """The face of a packaging box: a logo, bands, a table of facts, symbols, a bar code."""
-    width, height = LANDSCAPE
+    width = LANDSCAPE[0]
     main, second = _colour(rng), _colour(rng)
     face = tinted(plain(LANDSCAPE, (214, 224, 228)), cloud(rng, LANDSCAPE, 160, 5), 5)
     wave = np.arange(0, width + 1, 8)
@@ -204,7 +206,7 @@ def paint_map(rng: np.random.Generator) -> Image:
         stroke(town, course, (120, 208, 250) if line == 15 else (250, 252, 252), line)
     for _ in range(26):
         x, y = rng.uniform((10, 30), (width - 150, height - 20))
-        name = f"{str(rng.choice(['Mill', 'Oak', 'King', 'Bridge', 'Park', 'West', 'Harbour']))} St"
+        name = f"{rng.choice(['Mill', 'Oak', 'King', 'Bridge', 'Park', 'West', 'Harbour'])} St"
         write(town, name, (x, y), int(rng.choice([20, 24, 30])), (70, 62, 60), 600)
     for _ in range(22):
         x, y = rng.uniform((20, 20), (width - 20, height - 20))
@@ -218,7 +220,7 @@ def _blocks(town: Image, rng: np.random.Generator) -> None:
     for _ in range(170):
         x, y = rng.uniform((0, 0), LANDSCAPE)
         size = rng.uniform(14, 62, 2)
-        block = turned_box(x, y, size[0], size[1], float(rng.choice([0.2, 0.2, 1.1])))
+        block = turned_box((x, y), (size[0], size[1]), float(rng.choice([0.2, 0.2, 1.1])))
         shape(town, block, varied(rng, (186, 200, 212), 10))
         stroke(town, np.vstack([block, block[:1]]), (150, 166, 178), 2)
 
@@ -232,7 +234,7 @@ def paint_facade(rng: np.random.Generator) -> Image:
             _window(wall, x, y)
     wall = tinted(wall, cloud(rng, LANDSCAPE, 500, 2), 5)
     for x, y in rng.integers((0, 0), (10, 6), (4, 2)):
-        box(wall, x * 96 + 26, y * 120 + 28, 44, rng.integers(20, 60), _colour(rng))
+        box(wall, x * 96 + 26, y * 120 + 28, 44, int(rng.integers(20, 60)), _colour(rng))
     return wall
 
 
@@ -255,11 +257,25 @@ def paint_faint(rng: np.random.Generator) -> Image:
     for _ in range(9):
         x, y = rng.uniform((60, 60), (LANDSCAPE[0] - 60, LANDSCAPE[1] - 60))
         size = rng.uniform(16, 50, 2)
-        shape(card, turned_box(x, y, *size, rng.uniform(0, 3)), varied(rng, (190, 194, 198), 6))
+        shape(card, turned_box((x, y), size, rng.uniform(0, 3)), varied(rng, (190, 194, 198), 6))
     for _ in range(3):
         ends = rng.uniform((40, 40), (LANDSCAPE[0] - 40, LANDSCAPE[1] - 40), (2, 2))
         stroke(card, ends, (184, 188, 192), 4)
     return card
+
+
+def paint_letter(rng: np.random.Generator) -> Image:
+    """A letter: its head, lines of text, a signature."""
+    width, height = 600, 780
+    sheet = tinted(plain((width, height), (232, 238, 238)), cloud(rng, (width, height), 300, 3), 4)
+    disc(sheet, 90, 80, 38, _colour(rng))
+    text_block(sheet, rng, (380, 40, 180, 90), 20, INK)
+    for top in (200, 400):
+        text_block(sheet, rng, (60, top, 480, rng.uniform(100, 180)), 21, INK)
+    along = np.linspace(0, 1, 40)
+    pen = np.column_stack([90 + 220 * along, 680 + 30 * np.sin(along * rng.uniform(20, 40))])
+    stroke(sheet, pen, (120, 60, 40), 4)
+    return sheet
 
 
 def paint_book(rng: np.random.Generator) -> Image:

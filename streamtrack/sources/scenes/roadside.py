@@ -10,14 +10,12 @@ from streamtrack.sources.scenes.canvas import (
     Colour,
     box,
     cloud,
-    disc,
     frame_box,
     mixed,
     plain,
     round_box_points,
     shade,
     shape,
-    soft_shadow,
     stroke,
     tinted,
     varied,
@@ -70,8 +68,8 @@ def _asphalt(grass: Image, rng: np.random.Generator, middle: int, lane_px: int) 
         frame_box(road, x, y, *patch, (60, 58, 58), 2)
     for _ in range(26):
         x, y = rng.uniform((120, 10), (PERIOD - 120, 2 * half - 10))
-        crack = np.cumsum(rng.normal(0, 9, (10, 2)), axis=0).clip(-110, 110) + (x, y)
-        stroke(road, crack, (58, 56, 56), 2)
+        crack = np.cumsum(rng.normal(0, 9, (10, 2)), axis=0).clip(-110, 110)
+        stroke(road, np.add(crack, (x, y)), (58, 56, 56), 2)
     for y in (half - 5, half + 3):
         box(road, 0, y, PERIOD, 3, (90, 190, 228))
     for y in (half - 2 * lane_px - 2, half + 2 * lane_px - 2):
@@ -86,22 +84,22 @@ def _asphalt(grass: Image, rng: np.random.Generator, middle: int, lane_px: int) 
 def _beside(wide: Image, rng: np.random.Generator, middle: int, half: int, margin: int) -> Image:
     """Houses and trees, each drawn where it stands and one period further on."""
     height = wide.shape[0]
-    spots = []
+    spots: list[tuple[float, float, str]] = []
     for side in (-1, 1):
         for x in np.arange(90, PERIOD - 60, 280):
             y = middle + side * (half + 150 + rng.uniform(0, 50))
-            spots.append((x + rng.uniform(-30, 60), y, "house"))
+            spots.append((float(x) + rng.uniform(-30, 60), y, "house"))
     for _ in range(150):
         side = int(rng.choice([-1, 1]))
-        y = middle + side * (half + 60 + (height / 2 - half - 40) * rng.uniform() ** 0.8)
-        spots.append((rng.uniform(0, PERIOD), y, "tree"))
+        aside = half + 60 + (height / 2 - half - 40) * float(rng.uniform()) ** 0.8
+        spots.append((rng.uniform(0, PERIOD), middle + side * aside, "tree"))
     seeds = rng.integers(1 << 30, size=len(spots))
-    for (x, y, kind), seed in zip(spots, seeds, strict=True):
+    for (left, y, kind), seed in zip(spots, seeds, strict=True):
         if kind == "tree" and any(
-            o[2] == "house" and abs(o[0] - x) < 105 and abs(o[1] - y) < 90 for o in spots
+            o[2] == "house" and abs(o[0] - left) < 105 and abs(o[1] - y) < 90 for o in spots
         ):
             continue
-        for at in (x, x + PERIOD, x - PERIOD):
+        for at in (left, left + PERIOD, left - PERIOD):
             own = np.random.default_rng(int(seed))
             if kind == "house":
                 paint_house(wide, own, (at, y), (own.uniform(110, 150), own.uniform(76, 104)), 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -31,15 +32,15 @@ class Layer:
 class Scene:
     """All that is needed to render any moment and to tell the truth about it.
 
-    The backdrop is a picture of the size of the frame if the camera is fixed, else a ground with
-    its view. ``target`` is None where the target is part of the ground. ``exposure`` is a share
-    of the time between frames.
+    The backdrop, painted when first asked for, is a picture of the size of the frame if the camera
+    is fixed, else a ground with its view. ``target`` is None where the target is part of the
+    ground. ``exposure`` is a share of the time between frames.
     """
 
     size_wh: Size
     target_quad: Points
     frame_from_target: MatrixAt
-    backdrop: Image | Ground
+    backdrop: Callable[[], Image | Ground]
     frame_from_ground: MatrixAt | None
     target: Sprite | None
     occluders: tuple[Layer, ...]

@@ -61,7 +61,7 @@ def paint_house(
     angle: float,
 ) -> None:
     """A gabled or hipped roof with tiles, a chimney, perhaps solar panels."""
-    corners = turned_box(*middle, *size, angle)
+    corners = turned_box(middle, size, angle)
     height, width = land.shape[:2]
     if (corners.max(axis=0) < -30).any() or (corners.min(axis=0) > (width + 30, height + 30)).any():
         return
@@ -84,9 +84,9 @@ def paint_house(
 
 def _on_roof(land: Image, rng: np.random.Generator, corners: Line, right: Line, down: Line) -> None:
     at = corners[0] + rng.uniform(0.25, 0.75) * right + 0.36 * down
-    soft_shadow(land, turned_box(*at, 10, 10, 0), 2, 0.6, (5, 6))
-    shape(land, turned_box(*at, 11, 11, 0), (92, 104, 140))
-    shape(land, turned_box(*at, 5, 5, 0), (30, 30, 34))
+    soft_shadow(land, turned_box(at, (10, 10), 0), 2, 0.6, (5, 6))
+    shape(land, turned_box(at, (11, 11), 0), (92, 104, 140))
+    shape(land, turned_box(at, (5, 5), 0), (30, 30, 34))
     if rng.random() < 0.4:
         first = corners[0] + rng.uniform(0.2, 0.4) * right + 0.6 * down
         for k in range(3):
@@ -210,7 +210,7 @@ def _roads(land: Image, rng: np.random.Generator) -> list[Line]:
         stroke(land, course, (98, 132, 138), line + 6)
         stroke(land, course, (122, 122, 122) if line > 10 else (142, 170, 184), line)
         if line == 20:
-            for start in range(0, len(course) - 1):
+            for start in range(len(course) - 1):
                 ends = course[start] + np.array([[0.1], [0.5]]) * (
                     course[start + 1] - course[start]
                 )
@@ -230,7 +230,7 @@ def _villages(land: Image, rng: np.random.Generator, roads: list[Line], keep_out
             spot = course[at] + aside * rng.uniform(52, 66)
             if np.hypot(*(spot - keep_out)) < 150:
                 continue
-            garden = turned_box(*spot, 100, 84, angle)
+            garden = turned_box(spot, (100, 84), angle)
             shape(land, garden, varied(rng, (84, 144, 118), 16))
             stroke(land, np.vstack([garden, garden[:1]]), (54, 84, 66), 3)
             size = float(rng.uniform(42, 66)), float(rng.uniform(32, 44))
@@ -255,7 +255,7 @@ def _farm(land: Image, rng: np.random.Generator, landmark: Line) -> None:
     """The landmark: a farmhouse on its yard, with a barn, a car and trees."""
     x, y = landmark.mean(axis=0)
     width, height = np.ptp(landmark, axis=0)
-    yard = turned_box(x, y, 2.0 * width, 2.0 * height, 0.0)
+    yard = turned_box((x, y), (2.0 * width, 2.0 * height), 0.0)
     shape(land, yard, (150, 172, 184))
     low = np.maximum(yard[0], 0).astype(int)
     part = land[low[1] : int(yard[2][1]), low[0] : int(yard[2][0])]
@@ -264,6 +264,6 @@ def _farm(land: Image, rng: np.random.Generator, landmark: Line) -> None:
     for k in range(4):
         box(land, x - 0.4 * width + 0.22 * k * width, y + 0.2 * height, 10, 8, (150, 120, 90))
     paint_house(land, rng, (x - 0.74 * width, y - 0.1 * height), (0.36 * width, 0.9 * height), 0.0)
-    shape(land, turned_box(x + 0.72 * width, y + 0.6 * height, 30, 15, 0.5), (60, 60, 190))
+    shape(land, turned_box((x + 0.72 * width, y + 0.6 * height), (30, 15), 0.5), (60, 60, 190))
     for dx, dy in ((0.8, -0.7), (-0.85, 0.8), (0.5, 0.85)):
         paint_tree(land, rng, x + dx * width, y + dy * height, 15)

@@ -8,14 +8,15 @@ its variational refinement.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.registration import refused, register
+from streamtrack.registration import judge_mapping, refused, register
+from streamtrack.refine import refined
 from streamtrack.settings import RegistrationSettings
 from streamtrack.template import Patch, Template
 from streamtrack.types import Image, Mask, Matrix, Points, Registration, Verdict
@@ -64,7 +65,7 @@ class FlowAligner:
         self._template = template
         self._settings = settings
         self._coarse_flow = _make_flow(finest_scale=1)
-        self._fine_flow = _make_flow(finest_scale=0)
+        self._fine_flow = _make_flow(finest_scale=1)
 
     def align(self, view: FrameView, guess: Matrix) -> Alignment:
         """The pose near ``guess`` (frame_from_template): first coarse, then fine."""
@@ -79,9 +80,26 @@ class FlowAligner:
             if rough.registration.b_from_a is None:
                 return rough
             pose = rough.registration.b_from_a
-        return self._flow_step(
-            view, template.patches[fine], pose, self._fine_flow, self._settings.model
+        patch = template.patches[fine]
+        found = self._flow_step(view, patch, pose, self._fine_flow, self._settings.model)
+        return self._refined(view, patch, found)
+
+    def _refined(self, view: FrameView, patch: Patch, found: Alignment) -> Alignment:
+        """The alignment with its pose refined on the grey values around the inliers."""
+        registration = found.registration
+        if registration.b_from_a is None or registration.model is None:
+            return found
+        pose = refined(
+            lambda pose: _warp_back(view, patch, pose).image,
+            registration.b_from_a,
+            patch.patch_from_template,
+            patch.gradients,
+            _near_points(patch, found.template_points[registration.is_inlier]),
+            MODEL_OVERRIDE or registration.model,
         )
+        if pose is None or judge_mapping(pose, self._template.quad) is not Verdict.OK:
+            return found
+        return replace(found, registration=replace(registration, b_from_a=pose))
 
     def _flow_step(
         self, view: FrameView, patch: Patch, pose: Matrix, flow: cv2.DISOpticalFlow, model: str
@@ -124,6 +142,26 @@ class FlowAligner:
         is_inlier = np.zeros(len(template_points), np.bool_)
         is_inlier[np.flatnonzero(is_like)[found.is_inlier]] = True
         return Registration(found.verdict, found.b_from_a, found.model, is_inlier, found.rmse_px)
+
+
+import os
+from streamtrack.types import Model
+MODEL_OVERRIDE = Model(os.environ['MO']) if 'MO' in os.environ else None
+
+
+def _near_points(patch: Patch, template_points: Points) -> Mask:
+    """Which of the patch's gradient pixels (N,) lie near one of the points."""
+    columns, rows = (
+        np.rint(geometry.transform_points(patch.patch_from_template, template_points))
+        .astype(np.intp)
+        .T
+    )
+    near = np.zeros(patch.image.shape, np.uint8)
+    near[rows, columns] = 1
+    reach = max(7, round(0.05 * max(near.shape)))
+    near = np.asarray(cv2.dilate(near, np.ones((reach, reach), np.uint8)), np.uint8)
+    is_near: Mask = near.ravel()[patch.gradients.index] > 0
+    return is_near
 
 
 def patch_for(template: Template, frame_from_template: Matrix) -> int:

@@ -2,38 +2,57 @@
 
 Inverse compositional alignment (Baker & Matthews 2004, section 3.2) of the frame, warped back by
 the pose, with the template's patch: the Jacobian belongs to the template and is computed once.
-Both are high-pass filtered, so that light that changes smoothly over the target drops out, and
-the residuals are weighted by Tukey's biweight, so that occluders and highlights do.
+Both pictures are high-pass filtered, so that light that changes smoothly over the target drops
+out, and residuals are weighted by Tukey's biweight, so that occluders and highlights do.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from streamtrack.geometry import transform_points
-from streamtrack.types import Image, Matrix, Points
+from streamtrack.geometry import image_quad, inverted, normalized, transform_points
+from streamtrack.types import Image, Mask, Matrix, Model
 
 Floats = npt.NDArray[np.float32]
 
-PIXELS = 3500
+_PIXELS = 3500
+_MIN_PIXELS = 150
+_MIN_GRADIENT = 1.0
 _HIGH_PASS_PX = 17
 _ROUNDS = 3
-_CONVERGED_PX = 0.01
-_MIN_PIXELS = 60
+_CONVERGED_PX = 0.02
+_MAX_MOVE_PX = 4.0
+
+_BASES = {
+    Model.TRANSLATION: np.eye(8)[:, [2, 5]],
+    Model.SIMILARITY: np.stack(
+        [
+            np.eye(8)[2],
+            np.eye(8)[5],
+            np.eye(8)[0] + np.eye(8)[4],
+            np.eye(8)[3] - np.eye(8)[1],
+        ],
+        axis=1,
+    ),
+    Model.AFFINE: np.eye(8)[:, :6],
+    Model.HOMOGRAPHY: np.eye(8),
+}
+"""Columns: the directions in the homography's parameters h11 .. h32 that a model may move in."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gradients:
-    """The patch's most informative pixels.
+    """A patch's most informative pixels.
 
-    index     int (N,) places in the flattened patch
-    values    float32 (N,) high-passed grey values there
-    jacobian  float32 (N, 8) change of a value with the homography's parameters
-    unit_from_patch  coordinates in which those parameters are well scaled
+    index            int (N,), places in the flattened patch
+    values           float32 (N,), high-passed grey values there
+    jacobian         float32 (N, 8), change of a value with each parameter of a homography
+    unit_from_patch  the coordinates in which those parameters are well scaled
     """
 
     index: npt.NDArray[np.intp]
@@ -42,33 +61,99 @@ class Gradients:
     unit_from_patch: Matrix
 
 
-def make_gradients(image: Image, inside: npt.NDArray[np.bool_]) -> Gradients:
+def make_gradients(image: Image, inside: Mask) -> Gradients:
     """The pixels of a patch (h, w) with the strongest gradients, from every part of it."""
-    smooth = high_passed(image)
-    gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
-    gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
+    smooth = _high_passed(image)
+    gx = np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8), np.float32)
+    gy = np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8), np.float32)
+    index = _informative(np.hypot(gx, gy), inside)
     height, width = image.shape
-    strength = np.where(inside, np.hypot(gx, gy), 0)
-    # Relative to its surroundings, so that one strong texture does not take all the pixels.
-    around = cv2.boxFilter(strength.astype(np.float32), -1, (31, 31)) + 1.0
-    index = np.argsort(-(strength / np.sqrt(around)).ravel(), kind="stable")[:PIXELS]
-    index = np.sort(index[strength.ravel()[index] > 1.0])
-    scale = 2.0 / max(width, height)
+    unit = 2.0 / max(width, height)
     unit_from_patch = np.array(
-        [[scale, 0, -scale * (width - 1) / 2], [0, scale, -scale * (height - 1) / 2], [0, 0, 1]]
+        [[unit, 0, -unit * (width - 1) / 2], [0, unit, -unit * (height - 1) / 2], [0, 0, 1]]
     )
-    x = (index % width) * unit_from_patch[0, 0] + unit_from_patch[0, 2]
-    y = (index // width) * unit_from_patch[1, 1] + unit_from_patch[1, 2]
-    # Gradients per unit coordinate.
-    gx, gy = gx.ravel()[index] / scale, gy.ravel()[index] / scale
-    radial = gx * x + gy * y
-    jacobian = np.stack(
-        [gx * x, gx * y, gx, gy * x, gy * y, gy, -x * radial, -y * radial], axis=1
-    ).astype(np.float32)
-    return Gradients(index, smooth.ravel()[index], jacobian, unit_from_patch)
+    x = (index % width) * unit + unit_from_patch[0, 2]
+    y = (index // width) * unit + unit_from_patch[1, 2]
+    return Gradients(
+        index,
+        smooth.ravel()[index],
+        _jacobian(gx.ravel()[index] / unit, gy.ravel()[index] / unit, x, y),
+        unit_from_patch,
+    )
 
 
-def high_passed(image: Image) -> Floats:
-    """Grey values minus their local mean."""
+def refined(
+    warp_back: Callable[[Matrix], Image],
+    pose: Matrix,
+    patch_from_template: Matrix,
+    gradients: Gradients,
+    support: Mask,
+    model: Model,
+) -> Matrix | None:
+    """``pose`` (frame_from_template) moved to where the grey values fit best, or None.
+
+    ``warp_back`` gives the frame as the patch (h, w) would see it through a pose, ``support``
+    (N,) tells which of the gradients' pixels show the target. None if there are too few of
+    them, or if the alignment runs away: the caller then keeps what it has.
+    """
+    if np.count_nonzero(support) < _MIN_PIXELS:
+        return None
+    index, values = gradients.index[support], gradients.values[support]
+    basis = _BASES[model].astype(np.float32)
+    jacobian = gradients.jacobian[support] @ basis
+    moved_px = 0.0
+    for _ in range(_ROUNDS):
+        image = warp_back(pose)
+        step = _step(jacobian, values, _high_passed(image).ravel()[index])
+        if step is None:
+            return None
+        unit_step = np.eye(3) + np.append(basis @ step, 0.0).reshape(3, 3)
+        unit_from_patch = gradients.unit_from_patch
+        patch_step = inverted(unit_from_patch) @ unit_step @ unit_from_patch
+        corners = image_quad((image.shape[1], image.shape[0]))
+        change_px = float(np.abs(transform_points(patch_step, corners) - corners).max())
+        moved_px += change_px
+        if not moved_px < _MAX_MOVE_PX:
+            return None
+        pose = pose @ inverted(patch_from_template) @ inverted(patch_step) @ patch_from_template
+        if change_px < _CONVERGED_PX:
+            break
+    return normalized(pose)
+
+
+def _step(jacobian: Floats, values: Floats, seen: Floats) -> npt.NDArray[np.float64] | None:
+    """Parameters of the warp that takes the template's values to those seen; None if singular."""
+    gain = np.sqrt((np.median(values**2) + 1) / (np.median(seen**2) + 1))
+    residual = np.clip(gain, 0.4, 3.0) * seen - values
+    cut = 4.685 * (1.4826 * np.median(np.abs(residual)) + 1.0)
+    weights = np.maximum(0, 1 - (residual / cut) ** 2) ** 2
+    weighted = jacobian * weights[:, None]
+    normal = (weighted.T @ jacobian).astype(np.float64)
+    normal[np.diag_indices(len(normal))] *= 1 + 1e-6
+    try:
+        return np.linalg.solve(normal, (weighted.T @ residual).astype(np.float64))
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _high_passed(image: Image) -> Floats:
+    """Grey values, slightly smoothed, minus their local mean."""
     values = cv2.GaussianBlur(image, (3, 3), 0.8).astype(np.float32)
-    return values - cv2.blur(values, (_HIGH_PASS_PX, _HIGH_PASS_PX))
+    return np.asarray(values - cv2.blur(values, (_HIGH_PASS_PX, _HIGH_PASS_PX)), np.float32)
+
+
+def _informative(strength: Floats, inside: Mask) -> npt.NDArray[np.intp]:
+    """Places of the strongest gradients, each judged against its surroundings."""
+    strength = np.where(inside, strength, np.float32(0))
+    around = cv2.blur(strength, (31, 31)) + 1.0
+    order = np.argsort(-(strength / np.sqrt(around)).ravel(), kind="stable")[:_PIXELS]
+    return np.sort(order[strength.ravel()[order] > _MIN_GRADIENT])
+
+
+def _jacobian(
+    gx: Floats, gy: Floats, x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]
+) -> Floats:
+    """Gradient times the derivative of a homography at the identity (Baker & Matthews, eq. 99)."""
+    radial = gx * x + gy * y
+    columns = [gx * x, gx * y, gx, gy * x, gy * y, gy, -x * radial, -y * radial]
+    return np.stack(columns, axis=1).astype(np.float32)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from streamtrack import geometry
 from streamtrack.errors import TargetError
 from streamtrack.features import FeatureExtractor
+from streamtrack.refine import Gradients, make_gradients
 from streamtrack.types import Features, Image, Mask, Matrix, Points
 
 PATCH_AREA_PX = 36_000
@@ -35,6 +36,7 @@ class Patch:
     scale                patch pixels per template pixel
     points               float32 (N, 2) textured places inside the target, patch pixels
     template_points      the same places in template pixels
+    gradients            the pixels on which a pose is refined
     """
 
     image: Image
@@ -42,6 +44,7 @@ class Patch:
     scale: float
     points: Points
     template_points: Points
+    gradients: Gradients
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +99,8 @@ def _make_patch(
     inside = _polygon_mask(geometry.transform_points(patch_from_template, quad), size)
     points = _textured_points(image, inside)
     template_points = geometry.transform_points(geometry.inverted(patch_from_template), points)
-    return Patch(image, patch_from_template, scale, points, template_points)
+    gradients = make_gradients(image, inside)
+    return Patch(image, patch_from_template, scale, points, template_points, gradients)
 
 
 def warped_area(grey: Image, to_from_grey: Matrix, size: tuple[int, int]) -> Image:

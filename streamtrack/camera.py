@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 
 from streamtrack import geometry
+from streamtrack.frame_view import FrameView
 from streamtrack.matching import match
 from streamtrack.registration import register
 from streamtrack.settings import Settings
 from streamtrack.types import CameraPose, Features, Matrix, Registration, Track, Verdict
-from streamtrack.frame_view import FrameView
 
 _MIN_OVERLAP = 0.6
 _MIN_KEYFRAME_INLIERS = 60

@@ -4,7 +4,7 @@ Corner detectors (harris, fast, agast, gftt) see one scale only, so they run on 
 and the descriptor is computed on the pyramid level in which the corner was found. Detectors with
 a scale of their own (brisk, orb, sift, akaze) run once on the full picture.
 
-One meaning of ``threshold`` for each detector (`DETECTOR_THRESHOLDS` has the defaults):
+One meaning of ``threshold`` for each detector (`settings.DEFAULT_THRESHOLDS` has the defaults):
 
 harris  cornerness det(M) - 0.04 trace(M)^2 of the structure tensor from 3x3 Sobel gradients,
         summed over 3x3 pixels, grey values in 0..1 (Harris & Stephens 1988; `cv2.cornerHarris`)
@@ -32,16 +32,6 @@ from streamtrack.geometry import scaling, transform_points
 from streamtrack.settings import FeatureSettings
 from streamtrack.types import Features, Image, Points
 
-DETECTOR_THRESHOLDS = {
-    "harris": 1e-7,
-    "fast": 12.0,
-    "agast": 12.0,
-    "gftt": 0.005,
-    "brisk": 25.0,
-    "orb": 12.0,
-    "sift": 0.03,
-    "akaze": 0.0007,
-}
 _CORNERS = ("harris", "fast", "agast", "gftt")
 COMPATIBLE = {
     **dict.fromkeys(_CORNERS, ("freak", "brisk", "orb", "teblid", "sift")),
@@ -54,8 +44,12 @@ COMPATIBLE = {
 
 PYRAMID_STEP = 2**0.5
 _MIN_LEVEL_PX = 48
+_MIN_PICTURE_PX = 16
 _CORNER_SIZE_PX = 7.0
 _SPREAD_CELLS = 12
+_HIGHEST_THRESHOLD = {"fast": 255.0, "agast": 255.0, "gftt": 1.0, "brisk": 255.0, "orb": 255.0}
+# ORB calls the whole patch it describes the keypoint's size; FREAK and BRISK the keypoint alone.
+_SIZE_OF_ORB_KEYPOINT = {"freak": 7 / 31, "brisk": 12 / 31}
 _HARRIS_K = 0.04
 # TEBLID's `scale_factor` for each detector's notion of keypoint size (OpenCV's documentation).
 _TEBLID_SCALE = {"sift": 6.75, "orb": 1.0}
@@ -79,12 +73,15 @@ class FeatureExtractor:
                 f"descriptor '{settings.descriptor}' does not fit detector "
                 f"'{settings.detector}': use one of {', '.join(fitting)}"
             )
-        threshold = settings.threshold
-        if threshold is None:
-            threshold = DETECTOR_THRESHOLDS[settings.detector]
-        if not threshold > 0 or not np.isfinite(threshold):
-            raise UsageError(f"threshold {threshold} is not a positive number")
-        self.threshold = threshold
+        self.threshold = settings.threshold_or_default
+        if not self.threshold > 0 or not np.isfinite(self.threshold):
+            raise UsageError(f"threshold {self.threshold} is not a positive number")
+        highest = _HIGHEST_THRESHOLD.get(settings.detector)
+        if highest is not None and self.threshold > highest:
+            raise UsageError(
+                f"threshold {self.threshold:g} is too high for detector "
+                f"'{settings.detector}': it goes from 0 to {highest:g}"
+            )
         self._settings = settings
         self._describer = _make_describer(settings.detector, settings.descriptor)
         self._needs_angles = settings.descriptor in ("orb", "teblid", "sift")
@@ -95,6 +92,8 @@ class FeatureExtractor:
         ``mask`` (H, W) uint8 is zero where no keypoint may lie; descriptors still see the
         pixels there.
         """
+        if min(grey.shape) < _MIN_PICTURE_PX:
+            return no_features()
         if self._settings.detector in _CORNERS:
             return self._extract_from_pyramid(grey, mask)
         return self._extract_with_own_scale(grey, mask)
@@ -146,6 +145,9 @@ class FeatureExtractor:
             # Octaves mean something else to every descriptor; the keypoint's size says it all.
             for keypoint in chosen:
                 keypoint.octave = 0
+        if self._settings.detector == "orb":
+            for keypoint in chosen:
+                keypoint.size *= _SIZE_OF_ORB_KEYPOINT.get(self._settings.descriptor, 1.0)
         return self._described(grey, chosen)
 
     def _described(self, grey: Image, keypoints: Sequence[cv2.KeyPoint]) -> Features:
@@ -283,7 +285,7 @@ def _parabola_peaks(
 def _detect_gftt(grey: Image, threshold: float) -> Corners:
     no_mask = np.full(grey.shape, 255, np.uint8)
     corners, quality = cv2.goodFeaturesToTrackWithQuality(
-        grey, maxCorners=0, qualityLevel=min(threshold, 1.0), minDistance=3, mask=no_mask
+        grey, maxCorners=0, qualityLevel=threshold, minDistance=3, mask=no_mask
     )[:2]
     if corners is None:
         return np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
@@ -323,11 +325,12 @@ def _disc_offsets() -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
 
 @cache
 def _make_detector(name: str, threshold: float) -> cv2.Feature2D:
+    grey_levels = max(1, round(min(threshold, 255)))
     makers: dict[str, Callable[[], cv2.Feature2D]] = {
-        "fast": lambda: cv2.FastFeatureDetector.create(int(threshold)),
-        "agast": lambda: cv2.xfeatures2d.AgastFeatureDetector.create(int(threshold)),
-        "brisk": lambda: cv2.xfeatures2d.BRISK.create(int(threshold)),
-        "orb": lambda: cv2.ORB.create(20_000, fastThreshold=int(threshold)),
+        "fast": lambda: cv2.FastFeatureDetector.create(grey_levels),
+        "agast": lambda: cv2.xfeatures2d.AgastFeatureDetector.create(grey_levels),
+        "brisk": lambda: cv2.xfeatures2d.BRISK.create(grey_levels),
+        "orb": lambda: cv2.ORB.create(20_000, fastThreshold=grey_levels),
         "sift": lambda: cv2.SIFT.create(contrastThreshold=threshold),
         "akaze": lambda: cv2.xfeatures2d.AKAZE.create(threshold=threshold),
     }

@@ -15,12 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
+from streamtrack.frame_view import FrameView, level_from_frame
+from streamtrack.refine import Prior, refined
 from streamtrack.registration import judge_mapping, refused, register
-from streamtrack.refine import refined
 from streamtrack.settings import RegistrationSettings
 from streamtrack.template import Patch, Template
 from streamtrack.types import Image, Mask, Matrix, Points, Registration, Verdict
-from streamtrack.frame_view import FrameView, level_from_frame
 
 Floats = npt.NDArray[np.float32]
 
@@ -67,8 +67,11 @@ class FlowAligner:
         self._coarse_flow = _make_flow(finest_scale=1)
         self._fine_flow = _make_flow(finest_scale=1)
 
-    def align(self, view: FrameView, guess: Matrix) -> Alignment:
-        """The pose near ``guess`` (frame_from_template): first coarse, then fine."""
+    def align(self, view: FrameView, guess: Matrix, sigma_px: float | None = None) -> Alignment:
+        """The pose near ``guess`` (frame_from_template): first coarse, then fine, then refined.
+
+        ``sigma_px`` says how far from the guess the corners usually turn out to be, if known.
+        """
         template = self._template
         fine = patch_for(template, guess)
         coarse = min(fine + _COARSE_STEPS, len(template.patches) - 1)
@@ -82,9 +85,12 @@ class FlowAligner:
             pose = rough.registration.b_from_a
         patch = template.patches[fine]
         found = self._flow_step(view, patch, pose, self._fine_flow, self._settings.model)
-        return self._refined(view, patch, found)
+        prior = None if sigma_px is None else Prior(guess, template.quad, sigma_px)
+        return self._refined(view, patch, found, prior)
 
-    def _refined(self, view: FrameView, patch: Patch, found: Alignment) -> Alignment:
+    def _refined(
+        self, view: FrameView, patch: Patch, found: Alignment, prior: Prior | None
+    ) -> Alignment:
         """The alignment with its pose refined on the grey values around the inliers."""
         registration = found.registration
         if registration.b_from_a is None or registration.model is None:
@@ -95,7 +101,8 @@ class FlowAligner:
             patch.patch_from_template,
             patch.gradients,
             _near_points(patch, found.template_points[registration.is_inlier]),
-            MODEL_OVERRIDE or registration.model,
+            registration.model,
+            prior,
         )
         if pose is None or judge_mapping(pose, self._template.quad) is not Verdict.OK:
             return found
@@ -110,7 +117,8 @@ class FlowAligner:
         if np.count_nonzero(visible) < _MIN_VISIBLE_POINTS:
             return _refusal(Verdict.OUT_OF_VIEW, template_points)
         image = _matched_in_grey(warp.image, patch, visible)
-        field = np.asarray(flow.calc(patch.image, image, None), np.float32)
+        start = np.zeros((*image.shape, 2), np.float32)
+        field = np.asarray(flow.calc(patch.image, image, start), np.float32)
         columns, rows = patch.points[visible].astype(np.intp).T
         moved = patch.points[visible] + field[rows, columns]
         frame_points = geometry.transform_points(warp.frame_from_patch, moved)
@@ -144,11 +152,6 @@ class FlowAligner:
         return Registration(found.verdict, found.b_from_a, found.model, is_inlier, found.rmse_px)
 
 
-import os
-from streamtrack.types import Model
-MODEL_OVERRIDE = Model(os.environ['MO']) if 'MO' in os.environ else None
-
-
 def _near_points(patch: Patch, template_points: Points) -> Mask:
     """Which of the patch's gradient pixels (N,) lie near one of the points."""
     columns, rows = (
@@ -166,17 +169,11 @@ def _near_points(patch: Patch, template_points: Points) -> Mask:
 
 def patch_for(template: Template, frame_from_template: Matrix) -> int:
     """Index of the patch whose resolution fits the target's size in the frame."""
-    magnification = local_scale(frame_from_template, template.quad.mean(axis=0))
+    magnification = geometry.local_scale(frame_from_template, template.quad.mean(axis=0))
     for i, patch in enumerate(template.patches):
         if patch.scale <= 1.2 * magnification:
             return i
     return len(template.patches) - 1
-
-
-def local_scale(b_from_a: Matrix, point: npt.NDArray[np.generic]) -> float:
-    """Pixels of b per pixel of a at a point of a: root of the Jacobian's determinant."""
-    depth = float(b_from_a[2, 0] * point[0] + b_from_a[2, 1] * point[1] + b_from_a[2, 2])
-    return float(np.sqrt(abs(np.linalg.det(b_from_a) / depth**3)))
 
 
 def _make_flow(finest_scale: int) -> cv2.DISOpticalFlow:
@@ -193,7 +190,7 @@ def _warp_back(view: FrameView, patch: Patch, pose: Matrix) -> _Warp:
     height, width = patch.image.shape
     frame_from_patch = pose @ geometry.inverted(patch.patch_from_template)
     centre = np.array([width / 2, height / 2])
-    frame_px = local_scale(frame_from_patch, centre)
+    frame_px = geometry.local_scale(frame_from_patch, centre)
     octave = max(0, min(5, round(np.log2(max(frame_px, 1e-3)))))
     level_from_patch = level_from_frame(view, octave) @ frame_from_patch
     image = cv2.warpPerspective(

@@ -15,7 +15,7 @@ def transform_points(b_from_a: Matrix, points: npt.ArrayLike) -> Points:
     """
     pts = np.asarray(points, np.float64).reshape(-1, 2)
     mapped = pts @ b_from_a[:, :2].T + b_from_a[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         result: Points = (mapped[:, :2] / mapped[:, 2:]).astype(np.float32)
     return result
 
@@ -56,6 +56,12 @@ def scaling(factor_x: float, factor_y: float | None = None) -> Matrix:
             [0.0, 0.0, 1.0],
         ]
     )
+
+
+def local_scale(b_from_a: Matrix, point: npt.NDArray[np.generic]) -> float:
+    """Pixels of b per pixel of a at a point of a: root of the Jacobian's determinant."""
+    depth = float(b_from_a[2, 0] * point[0] + b_from_a[2, 1] * point[1] + b_from_a[2, 2])
+    return float(np.sqrt(abs(np.linalg.det(b_from_a) / depth**3)))
 
 
 def box_quad(x: float, y: float, width: float, height: float) -> Points:

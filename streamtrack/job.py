@@ -6,7 +6,7 @@ Whatever ends the run, what was produced until then is kept and properly closed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from itertools import chain
@@ -98,7 +98,7 @@ def run_track(job: TrackJob, progress: Progress, should_stop: Callable[[], bool]
     return summary
 
 
-def _steps(job: TrackJob, source: FrameSource) -> Iterator[Step]:
+def _steps(job: TrackJob, source: FrameSource) -> Generator[Step]:
     return track(
         source, job.targets, job.settings, start=job.start, step=job.step, frames=job.frames
     )

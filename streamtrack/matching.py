@@ -50,7 +50,7 @@ def _match(
     passes = best >= 0
     if distances.shape[1] == 2:
         has_second = neighbours[:, 1] >= 0
-        passes &= ~has_second | (distances[:, 0] <= settings.max_ratio * distances[:, 1])
+        passes &= ~has_second | (distances[:, 0] < settings.max_ratio * distances[:, 1])
     rows = np.flatnonzero(passes)
     if len(rows) == 0:
         return _no_matches()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from itertools import islice
 
 import numpy as np
@@ -12,13 +12,13 @@ from streamtrack import geometry
 from streamtrack.camera import make_camera
 from streamtrack.errors import UsageError
 from streamtrack.features import FeatureExtractor
+from streamtrack.frame_view import FrameView
 from streamtrack.settings import Settings
 from streamtrack.sources.base import FrameSource
 from streamtrack.targets import Target, check_quad_in_picture
 from streamtrack.template import make_template
 from streamtrack.tracker import DetectTracker, HybridTracker, TargetTracker
 from streamtrack.types import Step, Track
-from streamtrack.frame_view import FrameView
 
 
 def track(
@@ -29,7 +29,7 @@ def track(
     start: int = 0,
     step: int = 1,
     frames: int | None = None,
-) -> Iterator[Step]:
+) -> Generator[Step]:
     """Follow targets through a source, one `Step` a frame.
 
     Quads are in pixels of the first frame that is used: frame ``start`` of the source, then every
@@ -40,7 +40,7 @@ def track(
     extractor = FeatureExtractor(settings.features)
     trackers: list[TargetTracker] = []
     camera = make_camera(settings)
-    stop = None if frames is None else start + frames * step
+    stop = None if frames is None else start + max(0, (frames - 1) * step + 1)
     is_first = True
     for frame in islice(source, start, stop, step):
         began = time.perf_counter()
@@ -52,14 +52,13 @@ def track(
         camera_began = time.perf_counter()
         pose = camera.update(view, tracks)
         ended = time.perf_counter()
-        stage_ms = {
-            **track_ms,
-            "detect": view.detect_ms,
-            "camera": (ended - camera_began) * 1e3,
-            "total": (ended - began) * 1e3,
-        }
+        stage_ms = {**track_ms, "total": (ended - began) * 1e3}
+        if view.detected is not None:
+            stage_ms["detect"] = view.detect_ms
+        if settings.camera != "fixed":
+            stage_ms["camera"] = (ended - camera_began) * 1e3
         yield Step(frame, tracks, pose, view.detected, stage_ms)
-    if is_first and start > 0:
+    if is_first and start > 0 and frames != 0:
         raise UsageError(f"the source has no frame {start}: it ended before")
 
 
@@ -67,13 +66,15 @@ def _follow_all(
     trackers: Sequence[TargetTracker], view: FrameView
 ) -> tuple[tuple[Track, ...], dict[str, float]]:
     """Every target in the frame, and the milliseconds it took by the way it was found."""
-    tracks, track_ms = [], {"flow": 0.0, "match": 0.0}
+    tracks: list[Track] = []
+    track_ms: dict[str, float] = {}
     for tracker in trackers:
         began = time.perf_counter()
         detect_before = view.detect_ms
         tracks.append(tracker.update(view))
         spent_ms = (time.perf_counter() - began) * 1e3 - (view.detect_ms - detect_before)
-        track_ms["flow" if tracks[-1].means == "flow" else "match"] += spent_ms
+        stage = "flow" if tracks[-1].means == "flow" else "match"
+        track_ms[stage] = track_ms.get(stage, 0.0) + spent_ms
     return tuple(tracks), track_ms
 
 

@@ -102,7 +102,7 @@ def _warn_if_ffmpeg_is_missing(codec: str) -> None:
     if shutil.which("ffmpeg") is None:
         _log.warning(
             "the native Rerun viewer shows the %s video of this recording only with an ffmpeg "
-            "executable on PATH; 'streamtrack view --web' or '--video-mode av1|jpeg' needs none",
+            "executable on PATH; 'streamtrack view --web' or '--record-video av1|jpeg' needs none",
             codec,
         )
 

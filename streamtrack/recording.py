@@ -79,6 +79,7 @@ class Recorder:
         self._picture_bytes = 0
         self._has_points = False
         self._stages: dict[str, str] = {}
+        self._last_stages: set[str] = set()
         self._growth = (time.monotonic(), 0)
         self._is_closed = False
         _check_writable(path)
@@ -238,6 +239,9 @@ class Recorder:
             self._stream.log(blueprint.FEATURE_COUNT, recorded_rows.scalar(len(step.features)))
         for stage, milliseconds in step.stage_ms.items():
             self._stream.log(self._stage_path(stage), recorded_rows.scalar(milliseconds))
+        for stage in self._last_stages - step.stage_ms.keys():
+            self._stream.log(self._stage_path(stage), recorded_rows.scalar(math.nan))
+        self._last_stages = set(step.stage_ms)
 
     def _stage_path(self, stage: str) -> str:
         if stage == "total":

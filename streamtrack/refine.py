@@ -10,23 +10,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from streamtrack.geometry import image_quad, inverted, normalized, transform_points
-from streamtrack.types import Image, Mask, Matrix, Model
+from streamtrack.geometry import image_quad, inverted, local_scale, normalized, transform_points
+from streamtrack.types import Image, Mask, Matrix, Model, Points
 
 Floats = npt.NDArray[np.float32]
+Doubles = npt.NDArray[np.float64]
 
 _PIXELS = 3500
 _MIN_PIXELS = 150
 _MIN_GRADIENT = 1.0
 _HIGH_PASS_PX = 17
-_ROUNDS = 3
+_ROUNDS = 4
 _CONVERGED_PX = 0.02
 _MAX_MOVE_PX = 4.0
+
+_INDEPENDENT_SHARE = 1.0
+"""Neighbouring residuals are correlated: so much information a pixel, against independent ones."""
 
 _BASES = {
     Model.TRANSLATION: np.eye(8)[:, [2, 5]],
@@ -61,6 +66,19 @@ class Gradients:
     unit_from_patch: Matrix
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """Where motion says the target's corners (4, 2) are, seen through ``frame_from_template``.
+
+    ``sigma_px`` is how far from there, in frame pixels, they usually turn out to be. It hardly
+    counts where grey values tell, and decides where they do not: at corners that are hidden.
+    """
+
+    pose: Matrix
+    corners: Points
+    sigma_px: float
+
+
 def make_gradients(image: Image, inside: Mask) -> Gradients:
     """The pixels of a patch (h, w) with the strongest gradients, from every part of it."""
     smooth = _high_passed(image)
@@ -89,6 +107,7 @@ def refined(
     gradients: Gradients,
     support: Mask,
     model: Model,
+    prior: Prior | None,
 ) -> Matrix | None:
     """``pose`` (frame_from_template) moved to where the grey values fit best, or None.
 
@@ -99,16 +118,23 @@ def refined(
     if np.count_nonzero(support) < _MIN_PIXELS:
         return None
     index, values = gradients.index[support], gradients.values[support]
-    basis = _BASES[model].astype(np.float32)
-    jacobian = gradients.jacobian[support] @ basis
+    basis = _BASES[model]
+    jacobian = gradients.jacobian[support] @ basis.astype(np.float32)
     moved_px = 0.0
     for _ in range(_ROUNDS):
         image = warp_back(pose)
-        step = _step(jacobian, values, _high_passed(image).ravel()[index])
-        if step is None:
+        normal, gradient = _normal_equations(jacobian, values, _high_passed(image).ravel()[index])
+        unit_from_patch = gradients.unit_from_patch
+        if prior is not None:
+            unit_from_template = unit_from_patch @ patch_from_template
+            prior_normal, prior_gradient = _prior_equations(prior, pose, unit_from_template)
+            normal = normal + basis.T @ prior_normal @ basis
+            gradient = gradient + basis.T @ prior_gradient
+        try:
+            step = np.linalg.solve(normal, gradient)
+        except np.linalg.LinAlgError:
             return None
         unit_step = np.eye(3) + np.append(basis @ step, 0.0).reshape(3, 3)
-        unit_from_patch = gradients.unit_from_patch
         patch_step = inverted(unit_from_patch) @ unit_step @ unit_from_patch
         corners = image_quad((image.shape[1], image.shape[0]))
         change_px = float(np.abs(transform_points(patch_step, corners) - corners).max())
@@ -121,19 +147,37 @@ def refined(
     return normalized(pose)
 
 
-def _step(jacobian: Floats, values: Floats, seen: Floats) -> npt.NDArray[np.float64] | None:
-    """Parameters of the warp that takes the template's values to those seen; None if singular."""
+def _normal_equations(jacobian: Floats, values: Floats, seen: Floats) -> tuple[Doubles, Doubles]:
+    """Information matrix and vector of the warp that takes the template's values to those seen."""
     gain = np.sqrt((np.median(values**2) + 1) / (np.median(seen**2) + 1))
     residual = np.clip(gain, 0.4, 3.0) * seen - values
-    cut = 4.685 * (1.4826 * np.median(np.abs(residual)) + 1.0)
-    weights = np.maximum(0, 1 - (residual / cut) ** 2) ** 2
-    weighted = jacobian * weights[:, None]
+    noise = 1.4826 * float(np.median(np.abs(residual))) + 1.0
+    weights = np.maximum(0, 1 - (residual / (4.685 * noise)) ** 2) ** 2
+    weighted = jacobian * (weights * np.float32(_INDEPENDENT_SHARE / noise**2))[:, None]
     normal = (weighted.T @ jacobian).astype(np.float64)
     normal[np.diag_indices(len(normal))] *= 1 + 1e-6
-    try:
-        return np.linalg.solve(normal, (weighted.T @ residual).astype(np.float64))
-    except np.linalg.LinAlgError:
-        return None
+    return normal, (weighted.T @ residual).astype(np.float64)
+
+
+def _prior_equations(
+    prior: Prior, pose: Matrix, unit_from_template: Matrix
+) -> tuple[Doubles, Doubles]:
+    """What the expected corners add to the information, in unit coordinates.
+
+    The step's inverse is applied to the pose, so it should take each corner's expected place,
+    seen through the pose, to the corner itself.
+    """
+    corners = transform_points(unit_from_template, prior.corners).astype(np.float64)
+    unit_from_frame = unit_from_template @ inverted(pose)
+    expected = transform_points(unit_from_frame @ prior.pose, prior.corners).astype(np.float64)
+    frame_px = local_scale(pose @ inverted(unit_from_template), corners.mean(axis=0))
+    x, y = corners.T
+    one, zero = np.ones(4), np.zeros(4)
+    rows_x = np.stack([x, y, one, zero, zero, zero, -x * x, -x * y], axis=1)
+    rows_y = np.stack([zero, zero, zero, x, y, one, -x * y, -y * y], axis=1)
+    rows = np.concatenate([rows_x, rows_y]) * (frame_px / prior.sigma_px)
+    wanted = (corners - expected).T.ravel() * (frame_px / prior.sigma_px)
+    return rows.T @ rows, rows.T @ wanted
 
 
 def _high_passed(image: Image) -> Floats:
@@ -155,5 +199,8 @@ def _jacobian(
 ) -> Floats:
     """Gradient times the derivative of a homography at the identity (Baker & Matthews, eq. 99)."""
     radial = gx * x + gy * y
-    columns = [gx * x, gx * y, gx, gy * x, gy * y, gy, -x * radial, -y * radial]
+    columns: list[npt.NDArray[np.floating[Any]]] = [
+        *(gx * x, gx * y, gx, gy * x, gy * y, gy),
+        *(-x * radial, -y * radial),
+    ]
     return np.stack(columns, axis=1).astype(np.float32)

@@ -8,6 +8,7 @@ here as a refusal.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import lgamma, log
 
 import cv2
@@ -44,8 +45,15 @@ def register(
 
     ``a`` and ``b`` (M, 2) are paired points. ``region`` (4, 2) is the quad in a that the mapping
     is wanted for: the gate judges the mapping there. ``candidate_area_px`` is the area of b in
-    which a partner was looked for, which tells how easily pairs agree by chance.
+    which a partner was looked for, which tells how easily pairs agree by chance. Pairs with a
+    coordinate that is not finite are outliers.
     """
+    is_finite = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+    if not is_finite.all():
+        found = register(a[is_finite], b[is_finite], settings, region, candidate_area_px)
+        is_inlier = np.zeros(len(a), np.bool_)
+        is_inlier[is_finite] = found.is_inlier
+        return replace(found, is_inlier=is_inlier)
     if len(a) < max(4, settings.min_inliers):
         return refused(Verdict.TOO_FEW_MATCHES, len(a))
     is_inlier = robust_inliers(a, b, settings)
@@ -143,10 +151,16 @@ def _biweights(errors: Doubles, threshold_px: float) -> Doubles:
     if len(near) == 0:
         return np.zeros(len(errors))
     # The median length of a 2-D Gaussian error is 1.1774 times its standard deviation.
-    scale = float(np.median(near)) / 1.1774
+    scale = _median(near) / 1.1774
     cut = min(max(4.685 * scale, 0.25), threshold_px)
     weights: Doubles = np.where(errors < cut, (1 - (errors / cut) ** 2) ** 2, 0.0)
     return weights
+
+
+def _median(values: Doubles) -> float:
+    """The upper median: as good here as the mean of the two, and three times as fast."""
+    middle = len(values) // 2
+    return float(np.partition(values, middle)[middle])
 
 
 def fit(model: Model, a: Points, b: Points, weights: Doubles | None = None) -> Matrix:
@@ -155,7 +169,7 @@ def fit(model: Model, a: Points, b: Points, weights: Doubles | None = None) -> M
     used = w > 0
     pa, pb, w = a[used].astype(np.float64), b[used].astype(np.float64), w[used]
     if model is Model.TRANSLATION:
-        return geometry.translation(*np.average(pb - pa, axis=0, weights=w))
+        return geometry.translation(*_mean(pb - pa, w))
     if model is Model.SIMILARITY:
         return _fit_similarity(pa, pb, w)
     if model is Model.AFFINE:
@@ -165,7 +179,7 @@ def fit(model: Model, a: Points, b: Points, weights: Doubles | None = None) -> M
 
 def _fit_similarity(a: Doubles, b: Doubles, w: Doubles) -> Matrix:
     """Scale, rotation and shift as one complex number each: b = s a + t."""
-    mean_a, mean_b = np.average(a, axis=0, weights=w), np.average(b, axis=0, weights=w)
+    mean_a, mean_b = _mean(a, w), _mean(b, w)
     za = (a - mean_a) @ np.array([1, 1j])
     zb = (b - mean_b) @ np.array([1, 1j])
     spread = float(np.sum(w * np.abs(za) ** 2))
@@ -175,11 +189,18 @@ def _fit_similarity(a: Doubles, b: Doubles, w: Doubles) -> Matrix:
 
 
 def _fit_affine(a: Doubles, b: Doubles, w: Doubles) -> Matrix:
-    mean_a, mean_b = np.average(a, axis=0, weights=w), np.average(b, axis=0, weights=w)
-    root = np.sqrt(w)[:, None]
-    solved: Doubles = np.linalg.lstsq(root * (a - mean_a), root * (b - mean_b), rcond=None)[0]
-    linear = np.asarray(solved.T, np.float64)
+    mean_a, mean_b = _mean(a, w), _mean(b, w)
+    centred = a - mean_a
+    weighted = (centred * w[:, None]).T
+    # The pseudo-inverse leaves alone what collinear points do not determine.
+    linear = (np.linalg.pinv(weighted @ centred) @ (weighted @ (b - mean_b))).T
     return _affine_matrix(linear, mean_b - linear @ mean_a)
+
+
+def _mean(points: Doubles, weights: Doubles) -> Doubles:
+    """Weighted mean of points (N, 2)."""
+    mean: Doubles = weights @ points / weights.sum()
+    return mean
 
 
 def _affine_matrix(linear: Doubles, shift: Doubles) -> Matrix:
@@ -275,8 +296,9 @@ def _homography_jacobian(a: Doubles, homogeneous: Doubles) -> Doubles:
 def transfer_errors(b_from_a: Matrix, a: Points, b: Points) -> Doubles:
     """Distance (M,) in b between each mapped point of a and its partner; inf at the horizon."""
     _, residual = _residuals(b_from_a, a.astype(np.float64), b.astype(np.float64))
-    distances: Doubles = np.linalg.norm(residual, axis=1)
-    return np.nan_to_num(distances, nan=np.inf)
+    distances = np.hypot(residual[:, 0], residual[:, 1])
+    distances[np.isnan(distances)] = np.inf
+    return distances
 
 
 # -- choice of the model ------------------------------------------------------------------------
@@ -295,7 +317,7 @@ def choose_model(a: Points, b: Points, settings: RegistrationSettings) -> Model:
         return Model(settings.model)
     residuals = {model: transfer_errors(fit(model, a, b), a, b) for model in DEGREES_OF_FREEDOM}
     richest = residuals[Model.HOMOGRAPHY]
-    noise_px = max(_MIN_NOISE_PX, float(np.median(richest)) / 1.1774)
+    noise_px = max(_MIN_NOISE_PX, _median(richest) / 1.1774)
     penalty = log(4 * len(a))
 
     def gric(model: Model) -> float:

@@ -37,6 +37,19 @@ class VideoMode(StrEnum):
     NONE = "none"
 
 
+DEFAULT_THRESHOLDS: dict[str, float] = {
+    "harris": 1e-7,
+    "fast": 12.0,
+    "agast": 12.0,
+    "gftt": 0.005,
+    "brisk": 25.0,
+    "orb": 12.0,
+    "sift": 0.03,
+    "akaze": 0.0007,
+}
+"""The detectors' own thresholds; features.py says what each means."""
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -51,6 +64,10 @@ class FeatureSettings(_Section):
     descriptor: Descriptor = "freak"
     max_features: int = Field(default=1000, ge=8, le=100_000)
 
+    @property
+    def threshold_or_default(self) -> float:
+        return DEFAULT_THRESHOLDS[self.detector] if self.threshold is None else self.threshold
+
 
 class MatchingSettings(_Section):
     """Matching of descriptors."""
@@ -62,7 +79,7 @@ class RegistrationSettings(_Section):
     """Robust estimate and its gate."""
 
     model: ModelChoice = "auto"
-    inlier_threshold_px: float = Field(default=3.0, gt=0)
+    inlier_threshold_px: float = Field(default=3.0, gt=0, allow_inf_nan=False)
     min_inliers: int = Field(default=10, ge=4)
     seed: int = 1
 

@@ -150,13 +150,12 @@ class Summary:
         ``warping`` and ``blending`` are null: they belong to the summary of a mosaic.
         """
         features = self.settings.features
-        has_threshold = features.threshold is not None and math.isfinite(features.threshold)
         return {
             "source": self.source,
             "size": {"width": self.size_wh[0], "height": self.size_wh[1]},
             "frames": self.frames,
             "detector": features.detector,
-            "threshold": features.threshold if has_threshold else None,
+            "threshold": features.threshold_or_default,
             "descriptor": features.descriptor,
             "transformation_model": self.settings.registration.model,
             "warping": None,
@@ -188,14 +187,13 @@ class Summary:
     def rows(self) -> list[tuple[str, str]]:
         """(label, value) pairs for a table. Names are verbatim: escape them for markup."""
         features = self.settings.features
-        threshold = "default" if features.threshold is None else f"{features.threshold:g}"
         used = ", ".join(f"{model} {count}" for model, count in self.models.items())
         matches = f"mean {_number(self.matches, 1)}, median {_number(self.matches_median, 0)}"
         ms = f"median {_number(self.ms_median, 1)} ms, p95 {_number(self.ms_p95, 1)} ms"
         return [
             ("Source", f"{self.source}, {self.size_wh[0]}x{self.size_wh[1]}"),
             ("Detector", features.detector),
-            ("Threshold", threshold),
+            ("Threshold", f"{features.threshold_or_default:g}"),
             ("Descriptor", features.descriptor),
             ("Features", _number(self.features, 0, " a frame")),
             ("Matches", matches),

@@ -14,6 +14,7 @@ from streamtrack.types import Image, Points, Size
 
 _FORMS = "x,y,w,h or x1,y1,x2,y2,x3,y3,x4,y4 or PICTURE or PICTURE@x,y,w,h"
 _MIN_SIDE_PX = 8.0
+_MAX_COORDINATE = 1e6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,9 +56,11 @@ def parse_targets(texts: Sequence[str]) -> list[Target]:
 
 def _parse_target(text: str, default_name: str) -> Target:
     name, separator, rest = text.partition("=")
-    if not separator or not name.strip() or Path(text).is_file():
+    if not separator or not name.strip() or _is_picture(text):
         name, rest = default_name, text
     name, rest = name.strip(), rest.strip()
+    if not rest:
+        raise UsageError(f"target '{text}' is empty: give {_FORMS}")
     numbers = _parse_numbers(rest)
     if numbers is not None:
         return Target(name, quad=_quad_from_numbers(numbers, rest))
@@ -68,6 +71,11 @@ def _parse_target(text: str, default_name: str) -> Target:
     return Target(name, _quad_from_numbers(region_numbers, rest), _read_picture(path))
 
 
+def _is_picture(text: str) -> bool:
+    """True if all of the text is the path of a picture, with or without a region."""
+    return any(Path(part).is_file() for part in (text, text.rpartition("@")[0]) if part)
+
+
 def _parse_numbers(text: str) -> list[float] | None:
     try:
         return [float(part) for part in text.split(",")]
@@ -76,8 +84,8 @@ def _parse_numbers(text: str) -> list[float] | None:
 
 
 def _quad_from_numbers(numbers: list[float], text: str) -> Points:
-    if not np.all(np.isfinite(numbers)):
-        raise UsageError(f"target '{text}': every coordinate must be a finite number")
+    if not np.all(np.abs(numbers) <= _MAX_COORDINATE):
+        raise UsageError(f"target '{text}': every coordinate must be a finite number of pixels")
     if len(numbers) == 4:
         x, y, width, height = numbers
         if width <= 0 or height <= 0:
@@ -98,7 +106,7 @@ def _read_picture(text: str) -> Image:
     import cv2
 
     path = Path(text)
-    if not path.exists():
+    if not _exists(path):
         raise UsageError(f"target '{text}' is neither numbers nor a file: give {_FORMS}")
     data = np.fromfile(path, np.uint8) if path.is_file() else np.zeros(0, np.uint8)
     picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
@@ -107,14 +115,25 @@ def _read_picture(text: str) -> Image:
     return np.asarray(picture, np.uint8)
 
 
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # a name that no file can have, such as one of 5000 letters
+        return False
+
+
 def check_quad_in_picture(name: str, quad: Points, size_wh: Size) -> None:
-    """Raise TargetError unless the quad is large enough and mostly inside a picture."""
+    """Raise TargetError unless the quad is convex, large enough and mostly inside a picture."""
+    if not np.all(np.isfinite(quad)):
+        raise TargetError(f"target '{name}' has coordinates that are not finite numbers")
     sides = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1)
     if sides.min() < _MIN_SIDE_PX:
         raise TargetError(
             f"target '{name}' is only {sides.min():.0f} px wide or high: "
             f"it needs at least {_MIN_SIDE_PX:.0f} px"
         )
+    if not geometry.is_convex(quad):
+        raise TargetError(f"target '{name}' is no convex quad: give its corners in order around it")
     share = geometry.visible_share(quad, size_wh)
     if share < 0.5:
         x0, y0, x1, y1 = geometry.bounding_box(quad)

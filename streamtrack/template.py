@@ -80,7 +80,7 @@ def _make_patches(grey: Image, quad: Points) -> tuple[Patch, ...]:
     margin = max(2.0, _MARGIN_SHARE * max(x1 - x0, y1 - y0))
     x0, y0, x1, y1 = x0 - margin, y0 - margin, x1 + margin, y1 + margin
     finest = min(_MAX_ENLARGEMENT, (PATCH_AREA_PX / ((x1 - x0) * (y1 - y0))) ** 0.5)
-    patches = []
+    patches: list[Patch] = []
     for step in range(12):
         scale = finest * _SCALE_STEP**step
         size = round((x1 - x0) * scale), round((y1 - y0) * scale)

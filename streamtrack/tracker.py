@@ -21,6 +21,7 @@ from streamtrack.appearance import (
     chroma_distance,
 )
 from streamtrack.flow import Alignment, FlowAligner
+from streamtrack.frame_view import FrameView
 from streamtrack.matching import match, match_guided
 from streamtrack.registration import fit, refused, register
 from streamtrack.settings import Settings
@@ -36,10 +37,12 @@ from streamtrack.types import (
     TrackState,
     Verdict,
 )
-from streamtrack.frame_view import FrameView
 
 _GUIDED_RADIUS_PX = 60.0
 _COAST_FRAMES = 10
+_FIRST_SURPRISE_PX = 5.0
+_MIN_SURPRISE_PX = 1.0
+_SURPRISE_RATE = 0.2
 _COLOR_REACH_SHARE = 0.04
 
 
@@ -83,6 +86,7 @@ class HybridTracker:
         self._pose = first_pose
         self._step_pose: Matrix | None = None
         self._frames_lost = 0
+        self._surprise_px = _FIRST_SURPRISE_PX
         self._was_seen = first_pose is not None
         is_same_camera = first_pose is not None
         self._max_chroma_distance = (
@@ -107,8 +111,19 @@ class HybridTracker:
         if self._pose is None or self._frames_lost > _COAST_FRAMES:
             return None
         guess = self._pose if self._step_pose is None else self._step_pose @ self._pose
-        followed = self._aligner.align(view, guess)
+        sigma_px = self._surprise_px if self._frames_lost == 0 else None
+        followed = self._aligner.align(view, guess, sigma_px)
+        if followed.registration.b_from_a is not None and self._frames_lost == 0:
+            self._learn_surprise(guess, followed.registration.b_from_a)
         return followed if self._frames_lost == 0 else self._with_own_colors(followed, view)
+
+    def _learn_surprise(self, expected: Matrix, found: Matrix) -> None:
+        """How far the corners are from their prediction, averaged over the last frames."""
+        quad = self.template.quad
+        apart = geometry.transform_points(expected, quad) - geometry.transform_points(found, quad)
+        surprise_px = float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+        self._surprise_px += _SURPRISE_RATE * (surprise_px - self._surprise_px)
+        self._surprise_px = max(self._surprise_px, _MIN_SURPRISE_PX)
 
     def _with_own_colors(self, alignment: Alignment, view: FrameView) -> Alignment:
         """The alignment, refused if what it found has other colours than the target."""

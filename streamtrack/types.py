@@ -301,7 +301,8 @@ class Step:
     """All that one frame produced.
 
     ``features`` are the frame's own keypoints if any were detected in it (following a target
-    by flow needs none). ``stage_ms`` maps stage names to wall milliseconds, ``total`` among them.
+    by flow needs none). ``stage_ms`` maps the stages that ran to wall milliseconds, ``total``
+    among them.
     """
 
     frame: Frame

@@ -103,7 +103,9 @@ def _random_homography(rng: np.random.Generator, size_wh: Size) -> Matrix:
     corners = geometry.image_quad(size_wh)
     moved = corners + rng.uniform(-0.2, 0.2, (4, 2)) * min(size_wh)
     turned = cv2.getRotationMatrix2D(
-        (size_wh[0] / 2, size_wh[1] / 2), float(rng.uniform(-180, 180)), float(rng.uniform(0.6, 1.5))
+        (size_wh[0] / 2, size_wh[1] / 2),
+        float(rng.uniform(-180, 180)),
+        float(rng.uniform(0.6, 1.5)),
     )
     bent = cv2.getPerspectiveTransform(corners, moved.astype(np.float32))
     return geometry.normalized(np.vstack([turned, [0, 0, 1]]) @ bent)
@@ -119,9 +121,7 @@ def random_homography() -> MakeHomography:
 def _clip(uri: str, count: int, start: int, step: int) -> Clip:
     source = SyntheticSource(uri)
     indices = range(start, start + count * step, step)
-    frames = tuple(
-        replace(source.frame(i), index=n, time_s=n / 30) for n, i in enumerate(indices)
-    )
+    frames = tuple(replace(source.frame(i), index=n, time_s=n / 30) for n, i in enumerate(indices))
     return Clip(frames, tuple(source.truth(i) for i in indices))
 
 

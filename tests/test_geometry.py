@@ -17,7 +17,7 @@ SIZE = (320, 240)
 SQUARE = [[0, 0], [10, 0], [10, 10], [0, 10]]
 
 
-def masked_share(quad: npt.NDArray[np.float64], size_wh: Size, pad: int = 200) -> float:
+def masked_share(quad: npt.NDArray[np.float64], size_wh: Size, pad: int = 170) -> float:
     """Share of a quad inside a picture, by counting fine pixels of a larger canvas."""
     fine = 4
     width, height = size_wh[0] + 2 * pad, size_wh[1] + 2 * pad

@@ -40,9 +40,9 @@ def some_descriptors(
 def distances_between(ref: Descriptors, cur: Descriptors) -> npt.NDArray[np.float64]:
     if ref.dtype == np.uint8:
         bits = np.bitwise_count(np.bitwise_xor(ref[:, None], cur[None]))
-        return bits.sum(axis=2).astype(np.float64)
+        return np.asarray(bits.sum(axis=2), np.float64)
     difference = ref[:, None].astype(np.float64) - cur[None].astype(np.float64)
-    return np.sqrt((difference**2).sum(axis=2))
+    return np.asarray(np.linalg.norm(difference, axis=2), np.float64)
 
 
 def plainly_matched(
@@ -101,7 +101,9 @@ def test_an_unbounded_radius_guides_nothing(rng: np.random.Generator) -> None:
     ref, cur = some_descriptors(rng, "binary", 60, 60, 40)
     nowhere = np.zeros((60, 2), np.float32)
     guided = match_guided(features_of(ref), features_of(cur), nowhere, 1.0, MatchingSettings())
-    assert pairs_of(guided) == pairs_of(match(features_of(ref), features_of(cur), MatchingSettings()))
+    assert pairs_of(guided) == pairs_of(
+        match(features_of(ref), features_of(cur), MatchingSettings())
+    )
 
 
 def test_guidance_tells_twins_apart(rng: np.random.Generator) -> None:
@@ -129,9 +131,7 @@ def test_guidance_beyond_the_horizon_pairs_nothing(rng: np.random.Generator) -> 
 
 @pytest.mark.parametrize("kind", ["binary", "float"])
 @pytest.mark.parametrize(("refs", "curs"), [(0, 0), (0, 5), (5, 0)])
-def test_nothing_matches_nothing(
-    rng: np.random.Generator, kind: str, refs: int, curs: int
-) -> None:
+def test_nothing_matches_nothing(rng: np.random.Generator, kind: str, refs: int, curs: int) -> None:
     ref, cur = some_descriptors(rng, kind, refs, curs, 0)
     predicted = np.zeros((refs, 2), np.float32)
     for found in (

@@ -50,7 +50,7 @@ class Av1Encoder:
             codec.open()
         except (av.FFmpegError, ValueError) as error:
             raise OutputError(
-                f"cannot encode {size_wh[0]}x{size_wh[1]} as AV1: {error}; use --video-mode jpeg"
+                f"cannot encode {size_wh[0]}x{size_wh[1]} as AV1: {error}; use --record-video jpeg"
             ) from None
         self._codec = codec
 

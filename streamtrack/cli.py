@@ -7,7 +7,8 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -157,8 +158,11 @@ def track(
         frames,
     )
     console, errors = _consoles()
-    _show_warnings(errors, quiet)
-    with _progress(errors, quiet) as progress, _StopOnSignal() as stop:
+    with (
+        _warnings_shown(errors, quiet),
+        _progress(errors, quiet) as progress,
+        _StopOnSignal() as stop,
+    ):
         result = run_track(job, progress, stop)
     if not quiet:
         _print_summary(console, result.rows(), job.outputs.record)
@@ -220,7 +224,9 @@ def _consoles() -> tuple[Console, Console]:
     return Console(), Console(stderr=True)
 
 
-def _show_warnings(errors: Console, quiet: bool) -> None:
+@contextmanager
+def _warnings_shown(errors: Console, quiet: bool) -> Iterator[None]:
+    """Log records of the run go to stderr, above the progress bar if there is one."""
     from rich.logging import RichHandler
 
     handler: logging.Handler
@@ -230,7 +236,12 @@ def _show_warnings(errors: Console, quiet: bool) -> None:
         handler = logging.StreamHandler()
         handler.setFormatter(logging.Formatter("streamtrack: warning: %(message)s"))
     handler.setLevel(logging.ERROR if quiet else logging.WARNING)
-    logging.getLogger("streamtrack").addHandler(handler)
+    logger = logging.getLogger("streamtrack")
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
 
 
 def _progress(errors: Console, quiet: bool) -> Any:

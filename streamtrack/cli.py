@@ -37,6 +37,8 @@ _DESCRIPTORS = "freak, brisk, orb, teblid, sift, akaze"
 
 def main() -> None:
     """Run the program."""
+    # Rerun's own log lines: what matters of them is said in ours, in one line.
+    os.environ.setdefault("RUST_LOG", "off")
     exit_on_error(app)
 
 
@@ -163,11 +165,11 @@ def track(
         _progress(errors, quiet) as progress,
         _StopOnSignal() as stop,
     ):
-        result = run_track(job, progress, stop)
+        outcome = run_track(job, progress, stop)
     if not quiet:
-        _print_summary(console, result.rows(), job.outputs.record)
-    if stop():
-        raise StreamtrackError(f"{result.ended}: everything up to there is written")
+        _print_summary(console, outcome.summary.rows(), job.outputs.record)
+    if outcome.error is not None:
+        raise outcome.error
 
 
 @app.command()

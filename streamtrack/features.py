@@ -310,9 +310,7 @@ def _refined(grey: Image, points: Points) -> Points:
     cornerness = _cornerness(grey)
     height, width = grey.shape
     column, row = np.clip(np.rint(points), 2, (width - 3, height - 3)).astype(np.intp).T
-    around = np.stack(
-        [cornerness[row + dy, column + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
-    )
+    around = np.stack([cornerness[row + dy, column + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
     best = around.argmax(axis=0)
     return _parabola_peaks(cornerness, row + best // 3 - 1, column + best % 3 - 1)
 

@@ -11,9 +11,9 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from streamtrack.errors import SourceError, StreamtrackError
+from streamtrack.errors import OutputError, SourceError, StreamtrackError
 from streamtrack.pipeline import track
 from streamtrack.results import PosesWriter, check_tracks_path, open_tracks_writer
 from streamtrack.settings import Settings
@@ -22,6 +22,9 @@ from streamtrack.sources.base import FrameSource
 from streamtrack.summary import Summary, SummaryBuilder
 from streamtrack.targets import Target
 from streamtrack.types import SourceInfo, Step
+
+if TYPE_CHECKING:
+    from streamtrack.recording import Recorder
 
 _FALLBACK_RATE_HZ = 30.0
 
@@ -58,11 +61,18 @@ class Progress(Protocol):
     def advance(self, step: Step) -> None: ...
 
 
-def run_track(job: TrackJob, progress: Progress, should_stop: Callable[[], bool]) -> Summary:
-    """Run the job and return its summary.
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of a run: its summary, and what went wrong once frames were coming, if anything."""
 
-    Raises StreamtrackError after closing all outputs; the summary is written even then, its
-    ``ended`` saying why.
+    summary: Summary
+    error: StreamtrackError | None
+
+
+def run_track(job: TrackJob, progress: Progress, should_stop: Callable[[], bool]) -> Outcome:
+    """Run the job; all outputs are closed when it returns, whatever ended it.
+
+    Raises StreamtrackError if it cannot even start, or an output cannot be closed.
     """
     with ExitStack() as stack:
         source = stack.enter_context(
@@ -88,14 +98,13 @@ def run_track(job: TrackJob, progress: Progress, should_stop: Callable[[], bool]
                 progress.advance(step)
                 if should_stop():
                     ended = f"interrupted after frame {step.frame.index}"
+                    error = StreamtrackError(f"{ended}: everything up to there is written")
                     break
         except StreamtrackError as raised:
             error, ended = raised, str(raised)
         summary = builder.build(source.skipped, source.corrupt_packets, ended)
-        finish(summary)
-    if error is not None:
-        raise error
-    return summary
+        error = finish(summary) or error
+    return Outcome(summary, error)
 
 
 def _steps(job: TrackJob, source: FrameSource) -> Generator[Step]:
@@ -113,11 +122,15 @@ def _expected_frames(job: TrackJob, info: SourceInfo) -> int | None:
 
 def _open_watchers(
     job: TrackJob, source: FrameSource, stack: ExitStack
-) -> tuple[list[Callable[[Step], None]], Callable[[Summary], None]]:
-    """What to call for each Step, and what to call with the summary at the end."""
+) -> tuple[list[Callable[[Step], None]], Callable[[Summary], StreamtrackError | None]]:
+    """What to call for each Step, and what to call with the summary at the end.
+
+    The latter returns what went wrong with an output that did not stop the run.
+    """
     outputs, info = job.outputs, source.info
     watchers: list[Callable[[Step], None]] = []
     finishers: list[Callable[[Summary], None]] = []
+    recorder: Recorder | None = None
     if outputs.summary is not None:
         finishers.append(_summary_finisher(outputs.summary))
     if outputs.tracks is not None:
@@ -137,9 +150,14 @@ def _open_watchers(
         watchers.append(recorder.log)
         finishers.append(lambda summary: recorder.close(summary.to_markdown()))
 
-    def finish(summary: Summary) -> None:
+    def finish(summary: Summary) -> StreamtrackError | None:
         for finisher in finishers:
             finisher(summary)
+        if recorder is None or recorder.failed is None:
+            return None
+        return OutputError(
+            f"the recording {recorder.path} ended early ({recorder.failed}); all else is complete"
+        )
 
     return watchers, finish
 

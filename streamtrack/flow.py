@@ -37,12 +37,14 @@ _COARSE_STEPS = 2
 class Alignment:
     """Where the template's textured points were found in a frame, and the pose they give.
 
-    template_points, frame_points  float32 (N, 2) of those whose surroundings are in view
+    is_in_view                     bool (P,), which of the patch's points are in view
+    template_points, frame_points  float32 (N, 2) of those that are
     registration                   frame_from_template with its verdict
     correlation                    mean local correlation of the points that support the pose
     """
 
     registration: Registration
+    is_in_view: Mask
     template_points: Points
     frame_points: Points
     correlation: float
@@ -100,13 +102,20 @@ class FlowAligner:
             registration.b_from_a,
             patch.patch_from_template,
             patch.gradients,
-            _near_points(patch, found.template_points[registration.is_inlier]),
+            self._shown(patch, found),
             registration.model,
             prior,
         )
         if pose is None or judge_mapping(pose, self._template.quad) is not Verdict.OK:
             return found
         return replace(found, registration=replace(registration, b_from_a=pose))
+
+    def _shown(self, patch: Patch, found: Alignment) -> Mask:
+        """Which gradient pixels (N,) show the target: those whose nearest point is an inlier."""
+        is_inlier = np.zeros(len(patch.points), np.bool_)
+        is_inlier[np.flatnonzero(found.is_in_view)[found.registration.is_inlier]] = True
+        shown: Mask = is_inlier[patch.nearest_point]
+        return shown
 
     def _flow_step(
         self, view: FrameView, patch: Patch, pose: Matrix, flow: cv2.DISOpticalFlow, model: str
@@ -115,7 +124,7 @@ class FlowAligner:
         visible = warp.visible
         template_points = patch.template_points[visible]
         if np.count_nonzero(visible) < _MIN_VISIBLE_POINTS:
-            return _refusal(Verdict.OUT_OF_VIEW, template_points)
+            return _refusal(Verdict.OUT_OF_VIEW, visible, template_points)
         image = _matched_in_grey(warp.image, patch, visible)
         start = np.zeros((*image.shape, 2), np.float32)
         field = np.asarray(flow.calc(patch.image, image, start), np.float32)
@@ -130,7 +139,7 @@ class FlowAligner:
         mean = float(correlation[supported].mean()) if supported.any() else float("nan")
         if registration.verdict is Verdict.OK and share < _MIN_SUPPORTED_SHARE:
             registration = refused(Verdict.LOW_CORRELATION, len(supported), supported)
-        return Alignment(registration, template_points, frame_points, mean)
+        return Alignment(registration, visible, template_points, frame_points, mean)
 
     def _estimate(
         self,
@@ -150,21 +159,6 @@ class FlowAligner:
         is_inlier = np.zeros(len(template_points), np.bool_)
         is_inlier[np.flatnonzero(is_like)[found.is_inlier]] = True
         return Registration(found.verdict, found.b_from_a, found.model, is_inlier, found.rmse_px)
-
-
-def _near_points(patch: Patch, template_points: Points) -> Mask:
-    """Which of the patch's gradient pixels (N,) lie near one of the points."""
-    columns, rows = (
-        np.rint(geometry.transform_points(patch.patch_from_template, template_points))
-        .astype(np.intp)
-        .T
-    )
-    near = np.zeros(patch.image.shape, np.uint8)
-    near[rows, columns] = 1
-    reach = max(7, round(0.05 * max(near.shape)))
-    near = np.asarray(cv2.dilate(near, np.ones((reach, reach), np.uint8)), np.uint8)
-    is_near: Mask = near.ravel()[patch.gradients.index] > 0
-    return is_near
 
 
 def patch_for(template: Template, frame_from_template: Matrix) -> int:
@@ -261,6 +255,7 @@ def _local_correlation(a: Image, b: Image) -> Floats:
     return np.asarray(covariance / np.sqrt(variance_a * variance_b), np.float32)
 
 
-def _refusal(verdict: Verdict, template_points: Points) -> Alignment:
+def _refusal(verdict: Verdict, in_view: Mask, template_points: Points) -> Alignment:
     unknown = np.full_like(template_points, np.nan)
-    return Alignment(refused(verdict, len(template_points)), template_points, unknown, float("nan"))
+    registration = refused(verdict, len(template_points))
+    return Alignment(registration, in_view, template_points, unknown, float("nan"))

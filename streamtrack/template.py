@@ -37,6 +37,7 @@ class Patch:
     points               float32 (N, 2) textured places inside the target, patch pixels
     template_points      the same places in template pixels
     gradients            the pixels on which a pose is refined
+    nearest_point        int (gradient pixels,), row of the point nearest to each of them
     """
 
     image: Image
@@ -45,6 +46,7 @@ class Patch:
     points: Points
     template_points: Points
     gradients: Gradients
+    nearest_point: npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +102,17 @@ def _make_patch(
     points = _textured_points(image, inside)
     template_points = geometry.transform_points(geometry.inverted(patch_from_template), points)
     gradients = make_gradients(image, inside)
-    return Patch(image, patch_from_template, scale, points, template_points, gradients)
+    nearest = _nearest_rows(points, gradients.index, size[0])
+    return Patch(image, patch_from_template, scale, points, template_points, gradients, nearest)
+
+
+def _nearest_rows(points: Points, index: npt.NDArray[np.intp], width: int) -> npt.NDArray[np.intp]:
+    """Row of the point nearest to each pixel, given as a place in the flattened patch."""
+    if len(points) == 0:
+        return np.zeros(0, np.intp)
+    dx = (index % width)[:, None] - points[None, :, 0]
+    dy = (index // width)[:, None] - points[None, :, 1]
+    return np.asarray((dx * dx + dy * dy).argmin(axis=1), np.intp)
 
 
 def warped_area(grey: Image, to_from_grey: Matrix, size: tuple[int, int]) -> Image:

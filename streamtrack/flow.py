@@ -25,7 +25,7 @@ from streamtrack.types import Image, Mask, Matrix, Points, Registration, Verdict
 Floats = npt.NDArray[np.float32]
 
 _MIN_CORRELATION = 0.5
-_MIN_SUPPORTED_SHARE = 0.2
+_MIN_SUPPORTED_SHARE = 0.12
 _MIN_VISIBLE_POINTS = 10
 _CORRELATION_WINDOW = 11
 _NOISE_VARIANCE = 9.0

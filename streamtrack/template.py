@@ -21,6 +21,8 @@ _SCALE_STEP = 2**-0.5
 _MIN_PATCH_SIDE_PX = 28
 _FLOW_POINTS = 260
 _MIN_FLOW_POINTS = 12
+_FEW_POINTS = 25
+_EDGE_PX = 9
 _MARGIN_SHARE = 0.06
 _MIN_GRADIENT = 2.0
 """Grey levels per pixel in the weaker direction; noise of sigma 3 gives about 1.3."""
@@ -99,7 +101,12 @@ def _make_patch(
     patch_from_template = geometry.scaling(scale) @ geometry.translation(-corner[0], -corner[1])
     image = warped_area(grey, patch_from_template, size)
     inside = _polygon_mask(geometry.transform_points(patch_from_template, quad), size)
-    points = _textured_points(image, inside)
+    # What lies beyond the target's edge changes as it moves, so points keep away from it.
+    kernel = np.ones((_EDGE_PX, _EDGE_PX), np.uint8)
+    interior = cv2.erode(inside.astype(np.uint8), kernel) > 0
+    points = _textured_points(image, interior)
+    if len(points) < _FEW_POINTS:
+        points = _textured_points(image, inside)
     template_points = geometry.transform_points(geometry.inverted(patch_from_template), points)
     gradients = make_gradients(image, inside)
     nearest = _nearest_rows(points, gradients.index, size[0])

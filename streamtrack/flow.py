@@ -20,7 +20,7 @@ from streamtrack.refine import Prior, refined
 from streamtrack.registration import judge_mapping, refused, register
 from streamtrack.settings import RegistrationSettings
 from streamtrack.template import Patch, Template
-from streamtrack.types import Image, Mask, Matrix, Points, Registration, Verdict
+from streamtrack.types import Image, Mask, Matrix, Model, Points, Registration, Verdict
 
 Floats = npt.NDArray[np.float32]
 
@@ -97,18 +97,21 @@ class FlowAligner:
         registration = found.registration
         if registration.b_from_a is None or registration.model is None:
             return found
+        model = registration.model
+        if prior is not None and self._settings.model == "auto":
+            model = Model.HOMOGRAPHY  # what the evidence leaves open, the prior decides
         pose = refined(
             lambda pose: _warp_back(view, patch, pose).image,
             registration.b_from_a,
             patch.patch_from_template,
             patch.gradients,
             self._shown(patch, found),
-            registration.model,
+            model,
             prior,
         )
         if pose is None or judge_mapping(pose, self._template.quad) is not Verdict.OK:
             return found
-        return replace(found, registration=replace(registration, b_from_a=pose))
+        return replace(found, registration=replace(registration, b_from_a=pose, model=model))
 
     def _shown(self, patch: Patch, found: Alignment) -> Mask:
         """Which gradient pixels (N,) show the target: those whose nearest point is an inlier."""

@@ -43,6 +43,7 @@ _COAST_FRAMES = 10
 _FIRST_SURPRISE_PX = 5.0
 _MIN_SURPRISE_PX = 1.0
 _SURPRISE_RATE = 0.2
+_CLEAR_VIEW_SHARE = 0.5
 _COLOR_REACH_SHARE = 0.04
 
 
@@ -113,8 +114,11 @@ class HybridTracker:
         guess = self._pose if self._step_pose is None else self._step_pose @ self._pose
         sigma_px = self._surprise_px if self._frames_lost == 0 else None
         followed = self._aligner.align(view, guess, sigma_px)
-        if followed.registration.b_from_a is not None and self._frames_lost == 0:
-            self._learn_surprise(guess, followed.registration.b_from_a)
+        found = followed.registration
+        if found.b_from_a is not None and self._frames_lost == 0:
+            share = np.count_nonzero(found.is_inlier) / len(followed.is_in_view)
+            if share >= _CLEAR_VIEW_SHARE:
+                self._learn_surprise(guess, found.b_from_a)
         return followed if self._frames_lost == 0 else self._with_own_colors(followed, view)
 
     def _learn_surprise(self, expected: Matrix, found: Matrix) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.frame_view import FrameView, level_from_frame
+from streamtrack.frame_view import FrameView
 from streamtrack.refine import Prior, refined
 from streamtrack.registration import judge_mapping, refused, register
 from streamtrack.settings import RegistrationSettings
@@ -101,7 +101,7 @@ class FlowAligner:
         if prior is not None and self._settings.model == "auto":
             model = Model.HOMOGRAPHY  # what the evidence leaves open, the prior decides
         pose = refined(
-            lambda pose: _warp_back(view, patch, pose).image,
+            lambda pose: view.pyramid.warped(pose @ patch.template_from_patch, patch.size_wh),
             registration.b_from_a,
             patch.patch_from_template,
             patch.gradients,
@@ -185,18 +185,8 @@ def _make_flow(finest_scale: int) -> cv2.DISOpticalFlow:
 
 def _warp_back(view: FrameView, patch: Patch, pose: Matrix) -> _Warp:
     height, width = patch.image.shape
-    frame_from_patch = pose @ geometry.inverted(patch.patch_from_template)
-    centre = np.array([width / 2, height / 2])
-    frame_px = geometry.local_scale(frame_from_patch, centre)
-    octave = max(0, min(5, round(np.log2(max(frame_px, 1e-3)))))
-    level_from_patch = level_from_frame(view, octave) @ frame_from_patch
-    image = cv2.warpPerspective(
-        view.level(octave),
-        level_from_patch,
-        (width, height),
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    frame_from_patch = pose @ patch.template_from_patch
+    frame_px = geometry.local_scale(frame_from_patch, np.array([width / 2, height / 2]))
     in_frame = geometry.transform_points(frame_from_patch, patch.points)
     frame_width, frame_height = view.size_wh
     reach = 3 * frame_px
@@ -206,7 +196,8 @@ def _warp_back(view: FrameView, patch: Patch, pose: Matrix) -> _Warp:
         & (in_frame[:, 0] < frame_width - reach)
         & (in_frame[:, 1] < frame_height - reach)
     )
-    return _Warp(np.asarray(image, np.uint8), frame_from_patch, frame_px, visible)
+    image = view.pyramid.warped(frame_from_patch, (width, height))
+    return _Warp(image, frame_from_patch, frame_px, visible)
 
 
 def _matched_in_grey(image: Image, patch: Patch, visible: Mask) -> Image:

@@ -11,8 +11,9 @@ import numpy.typing as npt
 from streamtrack import geometry
 from streamtrack.errors import TargetError
 from streamtrack.features import FeatureExtractor
+from streamtrack.pyramid import Pyramid
 from streamtrack.refine import Gradients, make_gradients
-from streamtrack.types import Features, Image, Mask, Matrix, Points
+from streamtrack.types import Features, Image, Mask, Matrix, Points, Size
 
 PATCH_AREA_PX = 36_000
 """Area of the finest patch: more costs time and gains no accuracy."""
@@ -50,6 +51,14 @@ class Patch:
     gradients: Gradients
     nearest_point: npt.NDArray[np.intp]
 
+    @property
+    def size_wh(self) -> Size:
+        return self.image.shape[1], self.image.shape[0]
+
+    @property
+    def template_from_patch(self) -> Matrix:
+        return geometry.inverted(self.patch_from_template)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Template:
@@ -84,6 +93,7 @@ def _make_patches(grey: Image, quad: Points) -> tuple[Patch, ...]:
     margin = max(2.0, _MARGIN_SHARE * max(x1 - x0, y1 - y0))
     x0, y0, x1, y1 = x0 - margin, y0 - margin, x1 + margin, y1 + margin
     finest = min(_MAX_ENLARGEMENT, (PATCH_AREA_PX / ((x1 - x0) * (y1 - y0))) ** 0.5)
+    pyramid = Pyramid(grey)
     patches: list[Patch] = []
     for step in range(12):
         scale = finest * _SCALE_STEP**step
@@ -91,15 +101,15 @@ def _make_patches(grey: Image, quad: Points) -> tuple[Patch, ...]:
         if min(size) < _MIN_PATCH_SIDE_PX and patches:
             break
         size = max(size[0], 12), max(size[1], 12)
-        patches.append(_make_patch(grey, quad, (x0, y0), scale, size))
+        patches.append(_make_patch(pyramid, quad, (x0, y0), scale, size))
     return tuple(patches)
 
 
 def _make_patch(
-    grey: Image, quad: Points, corner: tuple[float, float], scale: float, size: tuple[int, int]
+    pyramid: Pyramid, quad: Points, corner: tuple[float, float], scale: float, size: tuple[int, int]
 ) -> Patch:
     patch_from_template = geometry.scaling(scale) @ geometry.translation(-corner[0], -corner[1])
-    image = warped_area(grey, patch_from_template, size)
+    image = pyramid.warped(geometry.inverted(patch_from_template), size)
     inside = _polygon_mask(geometry.transform_points(patch_from_template, quad), size)
     # What lies beyond the target's edge changes as it moves, so points keep away from it.
     kernel = np.ones((_EDGE_PX, _EDGE_PX), np.uint8)
@@ -120,26 +130,6 @@ def _nearest_rows(points: Points, index: npt.NDArray[np.intp], width: int) -> np
     dx = (index % width)[:, None] - points[None, :, 0]
     dy = (index // width)[:, None] - points[None, :, 1]
     return np.asarray((dx * dx + dy * dy).argmin(axis=1), np.intp)
-
-
-def warped_area(grey: Image, to_from_grey: Matrix, size: tuple[int, int]) -> Image:
-    """``grey`` resampled by a mapping that scales evenly, averaging where it shrinks."""
-    factor = float(np.sqrt(abs(np.linalg.det(to_from_grey[:2, :2]))))
-    while factor < 0.6 and min(grey.shape) >= 2:
-        half = cv2.resize(
-            grey, (grey.shape[1] // 2, grey.shape[0] // 2), interpolation=cv2.INTER_AREA
-        )
-        half_from_grey = geometry.scaling(
-            half.shape[1] / grey.shape[1], half.shape[0] / grey.shape[0]
-        )
-        to_from_grey = to_from_grey @ geometry.inverted(half_from_grey)
-        grey = np.asarray(half, np.uint8)
-        factor *= 2
-    flags = cv2.INTER_LINEAR if factor < 1.1 else cv2.INTER_CUBIC
-    warped = cv2.warpPerspective(
-        grey, to_from_grey, size, flags=flags, borderMode=cv2.BORDER_REPLICATE
-    )
-    return np.asarray(warped, np.uint8)
 
 
 def _polygon_mask(polygon: Points, size: tuple[int, int]) -> Mask:

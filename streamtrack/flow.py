@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
+from streamtrack.blur import motion_blur
 from streamtrack.frame_view import FrameView
 from streamtrack.refine import Prior, refined
 from streamtrack.registration import judge_mapping, refused, register
@@ -77,18 +78,32 @@ class FlowAligner:
         template = self._template
         fine = patch_for(template, guess)
         coarse = min(fine + _COARSE_STEPS, len(template.patches) - 1)
-        pose = guess
+        pose, patch = guess, template.patches[fine]
         if coarse > fine:
-            rough = self._flow_step(
-                view, template.patches[coarse], pose, self._coarse_flow, "affine"
-            )
+            rough, smear = self._roughly(view, template.patches[coarse], guess)
             if rough.registration.b_from_a is None:
                 return rough
             pose = rough.registration.b_from_a
-        patch = template.patches[fine]
+            if smear.any():
+                patch = patch.smeared(smear * (patch.scale / template.patches[coarse].scale))
         found = self._flow_step(view, patch, pose, self._fine_flow, self._settings.model)
         prior = None if sigma_px is None else Prior(guess, template.quad, sigma_px)
         return self._refined(view, patch, found, prior)
+
+    def _roughly(
+        self, view: FrameView, patch: Patch, guess: Matrix
+    ) -> tuple[Alignment, npt.NDArray[np.float64]]:
+        """The coarse alignment, and the motion blur under which it was found, in patch pixels."""
+        sharp = self._flow_step(view, patch, guess, self._coarse_flow, "affine")
+        pose = sharp.registration.b_from_a
+        seen = _warp_back(view, patch, guess if pose is None else pose)
+        smear = motion_blur(patch.image, seen.image, _near(patch, seen.visible))
+        if not smear.any():
+            return sharp, smear
+        smeared = self._flow_step(view, patch.smeared(smear), guess, self._coarse_flow, "affine")
+        if smeared.registration.inliers >= sharp.registration.inliers:
+            return smeared, smear
+        return sharp, np.zeros(2)
 
     def _refined(
         self, view: FrameView, patch: Patch, found: Alignment, prior: Prior | None
@@ -162,6 +177,15 @@ class FlowAligner:
         is_inlier = np.zeros(len(template_points), np.bool_)
         is_inlier[np.flatnonzero(is_like)[found.is_inlier]] = True
         return Registration(found.verdict, found.b_from_a, found.model, is_inlier, found.rmse_px)
+
+
+def _near(patch: Patch, rows: Mask) -> Mask:
+    """The surroundings (h, w) of some of the patch's points."""
+    columns, lines = patch.points[rows].astype(np.intp).T
+    near = np.zeros(patch.image.shape, np.uint8)
+    near[lines, columns] = 1
+    around: Mask = cv2.dilate(near, np.ones((9, 9), np.uint8)) > 0
+    return around
 
 
 def patch_for(template: Template, frame_from_template: Matrix) -> int:

@@ -66,6 +66,17 @@ class Gradients:
     unit_from_patch: Matrix
 
 
+def make_gradients(image: Image, inside: Mask) -> Gradients:
+    """The pixels of a patch (h, w) with the strongest gradients, from every part of it."""
+    smooth, gx, gy = _derivatives(image)
+    return _gradients_at(_informative(np.hypot(gx, gy), inside), smooth, gx, gy)
+
+
+def changed_gradients(gradients: Gradients, image: Image) -> Gradients:
+    """The same pixels of a patch whose grey values (h, w) have changed."""
+    return _gradients_at(gradients.index, *_derivatives(image))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
     """Where motion says the target's corners (4, 2) are, seen through ``frame_from_template``.
@@ -77,27 +88,6 @@ class Prior:
     pose: Matrix
     corners: Points
     sigma_px: float
-
-
-def make_gradients(image: Image, inside: Mask) -> Gradients:
-    """The pixels of a patch (h, w) with the strongest gradients, from every part of it."""
-    smooth = _high_passed(image)
-    gx = np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8), np.float32)
-    gy = np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8), np.float32)
-    index = _informative(np.hypot(gx, gy), inside)
-    height, width = image.shape
-    unit = 2.0 / max(width, height)
-    unit_from_patch = np.array(
-        [[unit, 0, -unit * (width - 1) / 2], [0, unit, -unit * (height - 1) / 2], [0, 0, 1]]
-    )
-    x = (index % width) * unit + unit_from_patch[0, 2]
-    y = (index // width) * unit + unit_from_patch[1, 2]
-    return Gradients(
-        index,
-        smooth.ravel()[index],
-        _jacobian(gx.ravel()[index] / unit, gy.ravel()[index] / unit, x, y),
-        unit_from_patch,
-    )
 
 
 def refined(
@@ -178,6 +168,30 @@ def _prior_equations(
     rows = np.concatenate([rows_x, rows_y]) * (frame_px / prior.sigma_px)
     wanted = (corners - expected).T.ravel() * (frame_px / prior.sigma_px)
     return rows.T @ rows, rows.T @ wanted
+
+
+def _derivatives(image: Image) -> tuple[Floats, Floats, Floats]:
+    """The high-passed values (h, w) and their derivatives a pixel along x and y."""
+    smooth = _high_passed(image)
+    gx = np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8), np.float32)
+    gy = np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8), np.float32)
+    return smooth, gx, gy
+
+
+def _gradients_at(index: npt.NDArray[np.intp], smooth: Floats, gx: Floats, gy: Floats) -> Gradients:
+    height, width = smooth.shape
+    unit = 2.0 / max(width, height)
+    unit_from_patch = np.array(
+        [[unit, 0, -unit * (width - 1) / 2], [0, unit, -unit * (height - 1) / 2], [0, 0, 1]]
+    )
+    x = (index % width) * unit + unit_from_patch[0, 2]
+    y = (index // width) * unit + unit_from_patch[1, 2]
+    return Gradients(
+        index,
+        smooth.ravel()[index],
+        _jacobian(gx.ravel()[index] / unit, gy.ravel()[index] / unit, x, y),
+        unit_from_patch,
+    )
 
 
 def _high_passed(image: Image) -> Floats:

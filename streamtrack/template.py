@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
+from streamtrack.blur import smeared_along
 from streamtrack.errors import TargetError
 from streamtrack.features import FeatureExtractor
 from streamtrack.pyramid import Pyramid
-from streamtrack.refine import Gradients, make_gradients
+from streamtrack.refine import Gradients, changed_gradients, make_gradients
 from streamtrack.types import Features, Image, Mask, Matrix, Points, Size
 
 PATCH_AREA_PX = 36_000
@@ -54,6 +55,11 @@ class Patch:
     @property
     def size_wh(self) -> Size:
         return self.image.shape[1], self.image.shape[0]
+
+    def smeared(self, vector: npt.NDArray[np.float64]) -> Patch:
+        """The patch under a motion blur ``vector`` (2,), in patch pixels."""
+        image = smeared_along(self.image, vector)
+        return replace(self, image=image, gradients=changed_gradients(self.gradients, image))
 
     @property
     def template_from_patch(self) -> Matrix:

@@ -16,6 +16,7 @@ from streamtrack.types import Image, Mask
 Doubles = npt.NDArray[np.float64]
 
 _SHARP_RATIO = 0.7
+_FACTORS = (0.6, 0.8, 1.0, 1.2, 1.45, 1.75)
 _LENGTHS_PX = (2.0, 3.0, 4.5, 6.5, 9.0, 12.5, 17.0)
 
 
@@ -30,42 +31,59 @@ def motion_blur(template: Image, seen: Image, area: Mask) -> Doubles:
         values, vectors = np.linalg.eig(np.linalg.solve(sharp, smeared))
     except np.linalg.LinAlgError:
         return np.zeros(2)
-    values = np.real(values)
-    if not values.max() > 0 or values.min() > _SHARP_RATIO * values.max():
+    lost_most = int(np.real(values).argmin())
+    if np.real(values[lost_most]) > _SHARP_RATIO * np.real(values[1 - lost_most]):
         return np.zeros(2)
-    along = np.real(vectors[:, values.argmin()])
-    along = along / np.linalg.norm(along)
+    along: Doubles = np.real(vectors[:, lost_most]).astype(np.float64)
+    along = along / np.hypot(along[0], along[1])
     across = np.array([-along[1], along[0]])
     wanted = _energy_ratio(smeared, sharp, along, across)
+    shorter_px, more_left = 0.0, 1.0
     for length_px in _LENGTHS_PX:
-        vector = along * length_px
-        if (
-            _energy_ratio(_structure(smeared_along(template, vector), area), sharp, along, across)
-            <= wanted
-        ):
-            return vector
-    return along * _LENGTHS_PX[-1]
+        tried = _structure(smeared_along(template, along * length_px), area)
+        left = _energy_ratio(tried, sharp, along, across)
+        if left <= wanted:
+            share = (more_left - wanted) / max(more_left - left, 1e-6)
+            return along * (shorter_px + min(1.0, share) * (length_px - shorter_px))
+        shorter_px, more_left = length_px, left
+    return along * shorter_px
+
+
+def fitted_length(template: Image, seen: Image, area: Mask, vector: Doubles) -> Doubles:
+    """``vector`` made longer or shorter, as ``seen``, now well aligned, correlates best."""
+    values = seen[area].astype(np.float64)
+
+    def correlation(factor: float) -> float:
+        smeared = smeared_along(template, vector * factor)[area].astype(np.float64)
+        return float(np.corrcoef(smeared, values)[0, 1])
+
+    best = max(_FACTORS, key=correlation)
+    return vector * best
 
 
 def smeared_along(image: Image, vector: Doubles) -> Image:
     """``image`` averaged along a line of length and direction ``vector`` (2,), in pixels."""
     reach = int(np.ceil(np.abs(vector).max() / 2)) + 1
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
-    for share in np.linspace(-0.5, 0.5, 4 * int(np.ceil(np.linalg.norm(vector))) + 1):
-        x, y = reach + share * vector
-        column, row = int(x), int(y)
-        fx, fy = x - column, y - row
-        kernel[row : row + 2, column : column + 2] += np.outer((1 - fy, fy), (1 - fx, fx))
-    kernel /= kernel.sum()
-    return np.asarray(cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE), np.uint8)
+    samples = 4 * int(np.ceil(np.linalg.norm(vector))) + 1
+    places = reach + np.linspace(-0.5, 0.5, samples)[:, None] * vector
+    whole = places.astype(np.intp)
+    fx, fy = (places - whole).T
+    column, row = whole.T
+    for dy, weight_y in ((0, 1 - fy), (1, fy)):
+        for dx, weight_x in ((0, 1 - fx), (1, fx)):
+            np.add.at(kernel, (row + dy, column + dx), weight_y * weight_x)
+    kernel /= samples
+    smeared = cv2.filter2D(image, -1, kernel, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(smeared, np.uint8)
 
 
 def _structure(image: Image, area: Mask) -> Doubles:
     """Sum of the gradients' outer products (2, 2) over an area, kept away from singular."""
-    gx = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3)[area]
-    gy = cv2.Sobel(image, cv2.CV_32F, 0, 1, ksize=3)[area]
+    gx = np.asarray(cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3), np.float64)[area]
+    gy = np.asarray(cv2.Sobel(image, cv2.CV_32F, 0, 1, ksize=3), np.float64)[area]
     gradients = np.stack([gx, gy])
-    return (gradients @ gradients.T).astype(np.float64) + np.eye(2)
+    return np.asarray(gradients @ gradients.T + np.eye(2), np.float64)
 
 
 def _energy_ratio(smeared: Doubles, sharp: Doubles, along: Doubles, across: Doubles) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.blur import motion_blur
+from streamtrack.blur import fitted_length, motion_blur
 from streamtrack.frame_view import FrameView
 from streamtrack.refine import Prior, refined
 from streamtrack.registration import judge_mapping, refused, register
@@ -101,9 +101,12 @@ class FlowAligner:
         if not smear.any():
             return sharp, smear
         smeared = self._flow_step(view, patch.smeared(smear), guess, self._coarse_flow, "affine")
-        if smeared.registration.inliers >= sharp.registration.inliers:
-            return smeared, smear
-        return sharp, np.zeros(2)
+        pose = smeared.registration.b_from_a
+        if pose is None or smeared.registration.inliers < sharp.registration.inliers:
+            return sharp, np.zeros(2)
+        seen = _warp_back(view, patch, pose)
+        area = _near(patch, seen.visible)
+        return smeared, fitted_length(patch.image, seen.image, area, smear)
 
     def _refined(
         self, view: FrameView, patch: Patch, found: Alignment, prior: Prior | None

@@ -88,6 +88,6 @@ def _structure(image: Image, area: Mask) -> Doubles:
 
 def _energy_ratio(smeared: Doubles, sharp: Doubles, along: Doubles, across: Doubles) -> float:
     """Share of the gradient energy left along a direction, against that left across it."""
-    left_along = (along @ smeared @ along) / (along @ sharp @ along)
-    left_across = (across @ smeared @ across) / (across @ sharp @ across)
-    return float(left_along / max(left_across, 1e-12))
+    left_along = float(along @ smeared @ along) / float(along @ sharp @ along)
+    left_across = float(across @ smeared @ across) / float(across @ sharp @ across)
+    return left_along / max(left_across, 1e-12)

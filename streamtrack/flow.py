@@ -19,9 +19,9 @@ from streamtrack.blur import fitted_length, motion_blur
 from streamtrack.frame_view import FrameView
 from streamtrack.refine import Prior, refined
 from streamtrack.registration import judge_mapping, refused, register
-from streamtrack.settings import RegistrationSettings
+from streamtrack.settings import ModelChoice, RegistrationSettings
 from streamtrack.template import Patch, Template
-from streamtrack.types import Image, Mask, Matrix, Model, Points, Registration, Verdict
+from streamtrack.types import Image, Mask, Matrix, Points, Registration, Verdict
 
 Floats = npt.NDArray[np.float32]
 
@@ -86,7 +86,11 @@ class FlowAligner:
             pose = rough.registration.b_from_a
             if smear.any():
                 patch = patch.smeared(smear * (patch.scale / template.patches[coarse].scale))
-        found = self._flow_step(view, patch, pose, self._fine_flow, self._settings.model)
+        # With a prior all freedoms are refined: what the evidence leaves open, the prior decides.
+        model = self._settings.model
+        if sigma_px is not None and model == "auto":
+            model = "homography"
+        found = self._flow_step(view, patch, pose, self._fine_flow, model, robust_rounds=1)
         prior = None if sigma_px is None else Prior(guess, template.quad, sigma_px)
         return self._refined(view, patch, found, prior)
 
@@ -94,13 +98,15 @@ class FlowAligner:
         self, view: FrameView, patch: Patch, guess: Matrix
     ) -> tuple[Alignment, npt.NDArray[np.float64]]:
         """The coarse alignment, and the motion blur under which it was found, in patch pixels."""
-        sharp = self._flow_step(view, patch, guess, self._coarse_flow, "affine")
+        sharp = self._flow_step(view, patch, guess, self._coarse_flow, "affine", robust_rounds=0)
         pose = sharp.registration.b_from_a
         seen = _warp_back(view, patch, guess if pose is None else pose)
         smear = motion_blur(patch.image, seen.image, _near(patch, seen.visible))
         if not smear.any():
             return sharp, smear
-        smeared = self._flow_step(view, patch.smeared(smear), guess, self._coarse_flow, "affine")
+        smeared = self._flow_step(
+            view, patch.smeared(smear), guess, self._coarse_flow, "affine", robust_rounds=0
+        )
         pose = smeared.registration.b_from_a
         if pose is None or smeared.registration.inliers < sharp.registration.inliers:
             return sharp, np.zeros(2)
@@ -115,21 +121,18 @@ class FlowAligner:
         registration = found.registration
         if registration.b_from_a is None or registration.model is None:
             return found
-        model = registration.model
-        if prior is not None and self._settings.model == "auto":
-            model = Model.HOMOGRAPHY  # what the evidence leaves open, the prior decides
         pose = refined(
             lambda pose: view.pyramid.warped(pose @ patch.template_from_patch, patch.size_wh),
             registration.b_from_a,
             patch.patch_from_template,
             patch.gradients,
             self._shown(patch, found),
-            model,
+            registration.model,
             prior,
         )
         if pose is None or judge_mapping(pose, self._template.quad) is not Verdict.OK:
             return found
-        return replace(found, registration=replace(registration, b_from_a=pose, model=model))
+        return replace(found, registration=replace(registration, b_from_a=pose))
 
     def _shown(self, patch: Patch, found: Alignment) -> Mask:
         """Which gradient pixels (N,) show the target: those whose nearest point is an inlier."""
@@ -139,7 +142,13 @@ class FlowAligner:
         return shown
 
     def _flow_step(
-        self, view: FrameView, patch: Patch, pose: Matrix, flow: cv2.DISOpticalFlow, model: str
+        self,
+        view: FrameView,
+        patch: Patch,
+        pose: Matrix,
+        flow: cv2.DISOpticalFlow,
+        model: ModelChoice,
+        robust_rounds: int,
     ) -> Alignment:
         warp = _warp_back(view, patch, pose)
         visible = warp.visible
@@ -154,7 +163,9 @@ class FlowAligner:
         frame_points = geometry.transform_points(warp.frame_from_patch, moved)
         correlation = _local_correlation(patch.image, _warped_by(image, field))[rows, columns]
         is_like = correlation >= _MIN_CORRELATION
-        registration = self._estimate(template_points, frame_points, is_like, warp.frame_px, model)
+        registration = self._estimate(
+            template_points, frame_points, is_like, warp.frame_px, model, robust_rounds
+        )
         supported = registration.is_inlier
         share = np.count_nonzero(supported) / len(supported)
         mean = float(correlation[supported].mean()) if supported.any() else float("nan")
@@ -168,14 +179,20 @@ class FlowAligner:
         frame_points: Points,
         is_like: Mask,
         frame_px: float,
-        model: str,
+        model: ModelChoice,
+        robust_rounds: int,
     ) -> Registration:
         settings = self._settings.model_copy(
             update={"inlier_threshold_px": 1.5 * frame_px, "model": model}
         )
         area = (2 * _SEARCH_PX * frame_px) ** 2
         found = register(
-            template_points[is_like], frame_points[is_like], settings, self._template.quad, area
+            template_points[is_like],
+            frame_points[is_like],
+            settings,
+            self._template.quad,
+            area,
+            robust_rounds,
         )
         is_inlier = np.zeros(len(template_points), np.bool_)
         is_inlier[np.flatnonzero(is_like)[found.is_inlier]] = True
@@ -234,11 +251,12 @@ def _matched_in_grey(image: Image, patch: Patch, visible: Mask) -> Image:
     than half the target does not set them. DIS itself removes the mean of each small block.
     """
     columns, rows = patch.points[visible].astype(np.intp).T
-    ours, theirs = patch.image[rows, columns], image[rows, columns]
-    low_p, mid_p, high_p = np.percentile(ours, (20, 50, 80))
-    low_w, mid_w, high_w = np.percentile(theirs, (20, 50, 80))
-    gain = float(np.clip((high_p - low_p + 2) / (high_w - low_w + 2), 0.3, 4.0))
-    adjusted = cv2.convertScaleAbs(image, alpha=gain, beta=float(mid_p - gain * mid_w))
+    ours, theirs = np.sort(patch.image[rows, columns]), np.sort(image[rows, columns])
+    low, middle, high = (int(share * len(ours)) for share in (0.2, 0.5, 0.8))
+    ours_range, theirs_range = (int(v[high]) - int(v[low]) + 2 for v in (ours, theirs))
+    gain = min(4.0, max(0.3, ours_range / theirs_range))
+    shift = float(ours[middle]) - gain * float(theirs[middle])
+    adjusted = cv2.convertScaleAbs(image, alpha=gain, beta=shift)
     return np.asarray(adjusted, np.uint8)
 
 

@@ -28,7 +28,8 @@ _MIN_GRADIENT = 1.0
 _HIGH_PASS_PX = 17
 _ROUNDS = 4
 _CONVERGED_PX = 0.02
-_MAX_MOVE_PX = 4.0
+_MAX_MOVE_SHARE = 0.1
+_SAMPLE_STEP = 4
 
 _INDEPENDENT_SHARE = 1.0
 """Neighbouring residuals are correlated: so much information a pixel, against independent ones."""
@@ -129,7 +130,7 @@ def refined(
         corners = image_quad((image.shape[1], image.shape[0]))
         change_px = float(np.abs(transform_points(patch_step, corners) - corners).max())
         moved_px += change_px
-        if not moved_px < _MAX_MOVE_PX:
+        if not moved_px < _MAX_MOVE_SHARE * max(image.shape):
             return None
         pose = pose @ inverted(patch_from_template) @ inverted(patch_step) @ patch_from_template
         if change_px < _CONVERGED_PX:
@@ -139,14 +140,21 @@ def refined(
 
 def _normal_equations(jacobian: Floats, values: Floats, seen: Floats) -> tuple[Doubles, Doubles]:
     """Information matrix and vector of the warp that takes the template's values to those seen."""
-    gain = np.sqrt((np.median(values**2) + 1) / (np.median(seen**2) + 1))
-    residual = np.clip(gain, 0.4, 3.0) * seen - values
-    noise = 1.4826 * float(np.median(np.abs(residual))) + 1.0
-    weights = np.maximum(0, 1 - (residual / (4.685 * noise)) ** 2) ** 2
+    gain = (_median_size(values) + 1) / (_median_size(seen) + 1)
+    residual = np.float32(min(3.0, max(0.4, gain))) * seen - values
+    noise = 1.4826 * _median_size(residual) + 1.0
+    weights = np.maximum(0, 1 - (residual * np.float32(1 / (4.685 * noise))) ** 2) ** 2
     weighted = jacobian * (weights * np.float32(_INDEPENDENT_SHARE / noise**2))[:, None]
     normal = (weighted.T @ jacobian).astype(np.float64)
     normal[np.diag_indices(len(normal))] *= 1 + 1e-6
     return normal, (weighted.T @ residual).astype(np.float64)
+
+
+def _median_size(values: Floats) -> float:
+    """Median of the absolute values, from every fourth of them."""
+    sizes = np.abs(values[::_SAMPLE_STEP])
+    middle = len(sizes) // 2
+    return float(np.partition(sizes, middle)[middle])
 
 
 def _prior_equations(

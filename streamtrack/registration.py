@@ -31,7 +31,7 @@ _MAX_AREA_RATIO = 60.0
 _MAX_PERSPECTIVE_RATIO = 40.0
 _MIN_SPREAD_SHARE = 0.02
 _MAX_LOG10_FALSE_ALARMS = -4.0
-_ROBUST_ROUNDS = 3
+ROBUST_ROUNDS = 3
 
 
 def register(
@@ -40,17 +40,21 @@ def register(
     settings: RegistrationSettings,
     region: Points,
     candidate_area_px: float,
+    robust_rounds: int = ROBUST_ROUNDS,
 ) -> Registration:
     """The gated mapping from picture a to picture b.
 
     ``a`` and ``b`` (M, 2) are paired points. ``region`` (4, 2) is the quad in a that the mapping
     is wanted for: the gate judges the mapping there. ``candidate_area_px`` is the area of b in
     which a partner was looked for, which tells how easily pairs agree by chance. Pairs with a
-    coordinate that is not finite are outliers.
+    coordinate that is not finite are outliers. ``robust_rounds`` of reweighted least squares end
+    the estimate; a caller that refines the mapping in another way needs none.
     """
     is_finite = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
     if not is_finite.all():
-        found = register(a[is_finite], b[is_finite], settings, region, candidate_area_px)
+        found = register(
+            a[is_finite], b[is_finite], settings, region, candidate_area_px, robust_rounds
+        )
         is_inlier = np.zeros(len(a), np.bool_)
         is_inlier[is_finite] = found.is_inlier
         return replace(found, is_inlier=is_inlier)
@@ -60,7 +64,9 @@ def register(
     if np.count_nonzero(is_inlier) < settings.min_inliers:
         return refused(Verdict.TOO_FEW_INLIERS, len(a), is_inlier)
     model = choose_model(a[is_inlier], b[is_inlier], settings)
-    b_from_a, is_inlier = fit_to_inliers(model, a, b, is_inlier, settings.inlier_threshold_px)
+    b_from_a, is_inlier = fit_to_inliers(
+        model, a, b, is_inlier, settings.inlier_threshold_px, robust_rounds
+    )
     inliers = int(np.count_nonzero(is_inlier))
     verdict = _judge_support(a, is_inlier, settings, region, candidate_area_px)
     if verdict is Verdict.OK:
@@ -122,16 +128,16 @@ def _as_mask(mask: npt.NDArray[np.generic] | None, count: int) -> Mask:
 
 
 def fit_to_inliers(
-    model: Model, a: Points, b: Points, is_inlier: Mask, threshold_px: float
+    model: Model, a: Points, b: Points, is_inlier: Mask, threshold_px: float, rounds: int
 ) -> tuple[Matrix, Mask]:
-    """Weighted least squares over the inliers, repeated with Tukey's biweight of the residuals.
+    """Least squares over the inliers, then ``rounds`` more with Tukey's biweight as weights.
 
     Returns b_from_a and the pairs (M,) within ``threshold_px`` of it. The weights fall to zero
     at 4.685 times the residuals' own scale (Huber & Ronchetti 2009), never beyond the threshold,
     so that good pairs sharpen the result and doubtful ones do not blur it.
     """
     b_from_a = fit(model, a[is_inlier], b[is_inlier])
-    for _ in range(_ROBUST_ROUNDS):
+    for _ in range(rounds):
         weights = _biweights(transfer_errors(b_from_a, a, b), threshold_px)
         if np.count_nonzero(weights) < DEGREES_OF_FREEDOM[model]:
             break

@@ -153,7 +153,8 @@ def smallest_gradient(image: Image) -> npt.NDArray[np.float32]:
     """
     eigenvalue = np.asarray(cv2.cornerMinEigenVal(image, 7, ksize=3), np.float32)
     # OpenCV divides 8-bit Sobel responses (gain 8) by 4 * 255 * block and sums block^2 of them.
-    return np.sqrt(np.maximum(eigenvalue, 0)) * np.float32(4 * 255 / 8)
+    gradient = np.sqrt(np.maximum(eigenvalue, 0)) * np.float32(4 * 255 / 8)
+    return np.asarray(gradient, np.float32)
 
 
 def _textured_points(image: Image, inside: Mask) -> Points:

@@ -194,7 +194,7 @@ def _composited(image: Image) -> Image:
         return image[:, :, 0]
     colour, alpha = image[:, :, :-1], image[:, :, -1]
     flat = colour if colour.shape[2] == 3 else colour[:, :, :1]
-    if alpha.min() < 255:
+    if np.any(alpha < 255):
         flat = (flat * (alpha[:, :, None] / np.float32(255)) + np.float32(0.5)).astype(np.uint8)
     return np.ascontiguousarray(flat if flat.shape[2] == 3 else flat[:, :, 0])
 

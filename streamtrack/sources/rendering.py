@@ -153,7 +153,7 @@ class Ground:
         matrix = frame_from_ground
         if self.period:
             corners = box_quad(0, 0, size_wh[0] - 1, size_wh[1] - 1)
-            left = float(transform_points(inverted(matrix), corners)[:, 0].min())
+            left = float(np.min(transform_points(inverted(matrix), corners)[:, 0]))
             matrix = matrix @ translation(self.period * math.floor((left - 2) / self.period), 0)
         box = (0, 0, *size_wh)
         return warp([self.picture], matrix, 1.0, box, True, cv2.BORDER_REPLICATE)

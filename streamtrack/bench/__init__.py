@@ -1,0 +1,1 @@
+"""The tracking benchmark: sequences with known truth, peers on the same frames, figures, report."""

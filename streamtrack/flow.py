@@ -18,10 +18,10 @@ from streamtrack import geometry
 from streamtrack.blur import fitted_length, motion_blur
 from streamtrack.frame_view import FrameView
 from streamtrack.refine import Prior, refined
-from streamtrack.registration import judge_mapping, refused, register
-from streamtrack.settings import ModelChoice, RegistrationSettings
+from streamtrack.registration import Effort, judge_mapping, poorest_model, refused, register
+from streamtrack.settings import RegistrationSettings
 from streamtrack.template import Patch, Template
-from streamtrack.types import Image, Mask, Matrix, Points, Registration, Verdict
+from streamtrack.types import Image, Mask, Matrix, Model, Points, Registration, Verdict
 
 Floats = npt.NDArray[np.float32]
 
@@ -31,7 +31,10 @@ _MIN_VISIBLE_POINTS = 10
 _CORRELATION_WINDOW = 11
 _NOISE_VARIANCE = 9.0
 _SEARCH_PX = 12.0
+_INLIER_PX = 1.5
 _COARSE_STEPS = 2
+_ROUGH = Effort((Model.AFFINE,), 0)
+_QUICK = Effort((Model.AFFINE, Model.HOMOGRAPHY), 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,11 +89,7 @@ class FlowAligner:
             pose = rough.registration.b_from_a
             if smear.any():
                 patch = patch.smeared(smear * (patch.scale / template.patches[coarse].scale))
-        # With a prior all freedoms are refined: what the evidence leaves open, the prior decides.
-        model = self._settings.model
-        if sigma_px is not None and model == "auto":
-            model = "homography"
-        found = self._flow_step(view, patch, pose, self._fine_flow, model, robust_rounds=1)
+        found = self._flow_step(view, patch, pose, self._fine_flow, _QUICK)
         prior = None if sigma_px is None else Prior(guess, template.quad, sigma_px)
         return self._refined(view, patch, found, prior)
 
@@ -98,15 +97,13 @@ class FlowAligner:
         self, view: FrameView, patch: Patch, guess: Matrix
     ) -> tuple[Alignment, npt.NDArray[np.float64]]:
         """The coarse alignment, and the motion blur under which it was found, in patch pixels."""
-        sharp = self._flow_step(view, patch, guess, self._coarse_flow, "affine", robust_rounds=0)
+        sharp = self._flow_step(view, patch, guess, self._coarse_flow, _ROUGH)
         pose = sharp.registration.b_from_a
         seen = _warp_back(view, patch, guess if pose is None else pose)
         smear = motion_blur(patch.image, seen.image, _near(patch, seen.visible))
         if not smear.any():
             return sharp, smear
-        smeared = self._flow_step(
-            view, patch.smeared(smear), guess, self._coarse_flow, "affine", robust_rounds=0
-        )
+        smeared = self._flow_step(view, patch.smeared(smear), guess, self._coarse_flow, _ROUGH)
         pose = smeared.registration.b_from_a
         if pose is None or smeared.registration.inliers < sharp.registration.inliers:
             return sharp, np.zeros(2)
@@ -131,8 +128,9 @@ class FlowAligner:
             prior,
         )
         if pose is None or judge_mapping(pose, self._template.quad) is not Verdict.OK:
-            return found
-        return replace(found, registration=replace(registration, b_from_a=pose))
+            pose = registration.b_from_a
+        model = poorest_model(pose, self._template.quad)
+        return replace(found, registration=replace(registration, b_from_a=pose, model=model))
 
     def _shown(self, patch: Patch, found: Alignment) -> Mask:
         """Which gradient pixels (N,) show the target: those whose nearest point is an inlier."""
@@ -147,8 +145,7 @@ class FlowAligner:
         patch: Patch,
         pose: Matrix,
         flow: cv2.DISOpticalFlow,
-        model: ModelChoice,
-        robust_rounds: int,
+        effort: Effort,
     ) -> Alignment:
         warp = _warp_back(view, patch, pose)
         visible = warp.visible
@@ -163,9 +160,7 @@ class FlowAligner:
         frame_points = geometry.transform_points(warp.frame_from_patch, moved)
         correlation = _local_correlation(patch.image, _warped_by(image, field))[rows, columns]
         is_like = correlation >= _MIN_CORRELATION
-        registration = self._estimate(
-            template_points, frame_points, is_like, warp.frame_px, model, robust_rounds
-        )
+        registration = self._estimate(patch, warp, moved, is_like, effort)
         supported = registration.is_inlier
         share = np.count_nonzero(supported) / len(supported)
         mean = float(correlation[supported].mean()) if supported.any() else float("nan")
@@ -175,28 +170,37 @@ class FlowAligner:
 
     def _estimate(
         self,
-        template_points: Points,
-        frame_points: Points,
+        patch: Patch,
+        warp: _Warp,
+        moved: Points,
         is_like: Mask,
-        frame_px: float,
-        model: ModelChoice,
-        robust_rounds: int,
+        effort: Effort,
     ) -> Registration:
-        settings = self._settings.model_copy(
-            update={"inlier_threshold_px": 1.5 * frame_px, "model": model}
-        )
-        area = (2 * _SEARCH_PX * frame_px) ** 2
+        """frame_from_template, from where the patch's points in view have moved in the warp.
+
+        The model is that of the remaining motion: what the guess had of richer models stays.
+        """
+        settings = self._settings.model_copy(update={"inlier_threshold_px": _INLIER_PX})
         found = register(
-            template_points[is_like],
-            frame_points[is_like],
+            patch.points[warp.visible][is_like],
+            moved[is_like],
             settings,
-            self._template.quad,
-            area,
-            robust_rounds,
+            geometry.transform_points(patch.patch_from_template, self._template.quad),
+            (2 * _SEARCH_PX) ** 2,
+            effort,
         )
-        is_inlier = np.zeros(len(template_points), np.bool_)
+        is_inlier = np.zeros(len(moved), np.bool_)
         is_inlier[np.flatnonzero(is_like)[found.is_inlier]] = True
-        return Registration(found.verdict, found.b_from_a, found.model, is_inlier, found.rmse_px)
+        if found.b_from_a is None:
+            return replace(found, is_inlier=is_inlier)
+        pose = geometry.normalized(
+            warp.frame_from_patch @ found.b_from_a @ patch.patch_from_template
+        )
+        verdict = judge_mapping(pose, self._template.quad)
+        if verdict is not Verdict.OK:
+            return refused(verdict, len(moved), is_inlier)
+        rmse_px = found.rmse_px * warp.frame_px
+        return Registration(Verdict.OK, pose, found.model, is_inlier, rmse_px)
 
 
 def _near(patch: Patch, rows: Mask) -> Mask:

@@ -8,7 +8,8 @@ here as a refusal.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from math import lgamma, log
 
 import cv2
@@ -31,7 +32,18 @@ _MAX_AREA_RATIO = 60.0
 _MAX_PERSPECTIVE_RATIO = 40.0
 _MIN_SPREAD_SHARE = 0.02
 _MAX_LOG10_FALSE_ALARMS = -4.0
-ROBUST_ROUNDS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How far an estimate is taken: the models to choose from under ``auto``, and the rounds of
+    reweighted least squares."""
+
+    ladder: tuple[Model, ...]
+    robust_rounds: int
+
+
+FULL = Effort(tuple(Model), 3)
 
 
 def register(
@@ -40,21 +52,19 @@ def register(
     settings: RegistrationSettings,
     region: Points,
     candidate_area_px: float,
-    robust_rounds: int = ROBUST_ROUNDS,
+    effort: Effort = FULL,
 ) -> Registration:
     """The gated mapping from picture a to picture b.
 
     ``a`` and ``b`` (M, 2) are paired points. ``region`` (4, 2) is the quad in a that the mapping
     is wanted for: the gate judges the mapping there. ``candidate_area_px`` is the area of b in
     which a partner was looked for, which tells how easily pairs agree by chance. Pairs with a
-    coordinate that is not finite are outliers. ``robust_rounds`` of reweighted least squares end
-    the estimate; a caller that refines the mapping in another way needs none.
+    coordinate that is not finite are outliers. ``effort`` is less where the caller refines the
+    mapping in another way.
     """
     is_finite = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
     if not is_finite.all():
-        found = register(
-            a[is_finite], b[is_finite], settings, region, candidate_area_px, robust_rounds
-        )
+        found = register(a[is_finite], b[is_finite], settings, region, candidate_area_px, effort)
         is_inlier = np.zeros(len(a), np.bool_)
         is_inlier[is_finite] = found.is_inlier
         return replace(found, is_inlier=is_inlier)
@@ -63,9 +73,10 @@ def register(
     is_inlier = robust_inliers(a, b, settings)
     if np.count_nonzero(is_inlier) < settings.min_inliers:
         return refused(Verdict.TOO_FEW_INLIERS, len(a), is_inlier)
-    model = choose_model(a[is_inlier], b[is_inlier], settings)
+    ladder = effort.ladder if settings.model == "auto" else (Model(settings.model),)
+    model = choose_model(a[is_inlier], b[is_inlier], ladder)
     b_from_a, is_inlier = fit_to_inliers(
-        model, a, b, is_inlier, settings.inlier_threshold_px, robust_rounds
+        model, a, b, is_inlier, settings.inlier_threshold_px, effort.robust_rounds
     )
     inliers = int(np.count_nonzero(is_inlier))
     verdict = _judge_support(a, is_inlier, settings, region, candidate_area_px)
@@ -310,8 +321,8 @@ def transfer_errors(b_from_a: Matrix, a: Points, b: Points) -> Doubles:
 # -- choice of the model ------------------------------------------------------------------------
 
 
-def choose_model(a: Points, b: Points, settings: RegistrationSettings) -> Model:
-    """The model asked for, or under ``auto`` the one with the least GRIC.
+def choose_model(a: Points, b: Points, ladder: Sequence[Model] = tuple(Model)) -> Model:
+    """The model of a ladder, poorest first, with the least GRIC.
 
     Geometric Robust Information Criterion (Torr 1998, "Geometric motion segmentation and model
     selection"): sum of min(e^2 / s^2, 2 (r - d)) + l1 d n + l2 k with r = 4 coordinates a pair,
@@ -319,10 +330,10 @@ def choose_model(a: Points, b: Points, settings: RegistrationSettings) -> Model:
     models, so left out) and l2 = ln(r n). The noise s is that of the richest model's residuals,
     at least `_MIN_NOISE_PX`. It asks of each further freedom that it pays in residuals.
     """
-    if settings.model != "auto":
-        return Model(settings.model)
-    residuals = {model: transfer_errors(fit(model, a, b), a, b) for model in DEGREES_OF_FREEDOM}
-    richest = residuals[Model.HOMOGRAPHY]
+    if len(ladder) == 1:
+        return ladder[0]
+    residuals = {model: transfer_errors(fit(model, a, b), a, b) for model in ladder}
+    richest = residuals[ladder[-1]]
     noise_px = max(_MIN_NOISE_PX, _median(richest) / 1.1774)
     penalty = log(4 * len(a))
 
@@ -330,10 +341,19 @@ def choose_model(a: Points, b: Points, settings: RegistrationSettings) -> Model:
         cost = np.minimum((residuals[model] / noise_px) ** 2, 4.0)
         return float(cost.sum()) + penalty * DEGREES_OF_FREEDOM[model]
 
-    return min(DEGREES_OF_FREEDOM, key=gric)
+    return min(ladder, key=gric)
 
 
 _MIN_NOISE_PX = 0.05
+
+
+def poorest_model(b_from_a: Matrix, region: Points) -> Model:
+    """The model of fewest freedoms that maps the quad ``region`` (4, 2) like ``b_from_a``."""
+    quad = geometry.transform_points(b_from_a, region)
+    for model in Model:
+        if transfer_errors(fit(model, region, quad), region, quad).max() < _MIN_NOISE_PX:
+            return model
+    return Model.HOMOGRAPHY
 
 
 # -- the gate -----------------------------------------------------------------------------------

@@ -169,7 +169,9 @@ class HybridTracker:
         found = alignment.registration
         assert found.b_from_a is not None
         if self._pose is not None and self._frames_lost == 0 and means == "flow":
-            self._step_pose = _shared_motion(self.template.quad, self._pose, found.b_from_a)
+            has_one_shape = self._settings.registration.model == "translation"
+            model = Model.TRANSLATION if has_one_shape else Model.SIMILARITY
+            self._step_pose = _shared_motion(model, self.template.quad, self._pose, found.b_from_a)
         else:
             self._step_pose = None
         self._pose = found.b_from_a
@@ -181,13 +183,13 @@ class HybridTracker:
         )
 
 
-def _shared_motion(quad: Points, before: Matrix, after: Matrix) -> Matrix:
-    """The similarity that carried the quad from one frame to the next, for the prediction.
+def _shared_motion(model: Model, quad: Points, before: Matrix, after: Matrix) -> Matrix:
+    """What carried the quad from one frame to the next, for the prediction.
 
-    Four freedoms extrapolate well; the perspective ones would mostly extrapolate noise.
+    A similarity's four freedoms extrapolate well; the perspective ones would mostly extrapolate noise.
     """
     return fit(
-        Model.SIMILARITY,
+        model,
         geometry.transform_points(before, quad),
         geometry.transform_points(after, quad),
     )

@@ -262,9 +262,9 @@ def _detect_corners(name: str, grey: Image, threshold: float) -> Corners:
 
 
 def _detect_harris(grey: Image, threshold: float) -> Corners:
-    """Local maxima (3x3) of the cornerness map above the threshold, to sub-pixel."""
+    """Local maxima (5x5) of the cornerness map above the threshold, to sub-pixel."""
     cornerness = _cornerness(grey)
-    is_peak = cornerness == cv2.dilate(cornerness, np.ones((3, 3), np.uint8))
+    is_peak = cornerness == cv2.dilate(cornerness, np.ones((5, 5), np.uint8))
     is_peak &= cornerness > threshold
     is_peak[[0, -1], :] = False
     is_peak[:, [0, -1]] = False

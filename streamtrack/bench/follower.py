@@ -67,8 +67,9 @@ def corners_in(grey: Image, mask: Image, most: int, apart_px: float) -> Points:
     return np.asarray(found, np.float32).reshape(-1, 2)
 
 
-LK = {
-    "winSize": (21, 21),
+LK_WINDOW_PX = 21
+_LK = {
+    "winSize": (LK_WINDOW_PX, LK_WINDOW_PX),
     "maxLevel": 3,
     "criteria": (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01),
 }
@@ -80,8 +81,8 @@ def lucas_kanade(a: Image, b: Image, points: Points) -> tuple[Points, npt.NDArra
     if not len(points):
         return points, np.zeros(0, np.bool_)
     start = points.reshape(-1, 1, 2)
-    there, is_found, _ = cv2.calcOpticalFlowPyrLK(a, b, start, None, **LK)  # type: ignore[call-overload]
-    back, is_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, **LK)  # type: ignore[call-overload]
+    there, is_found, _ = cv2.calcOpticalFlowPyrLK(a, b, start, None, **_LK)  # type: ignore[call-overload]
+    back, is_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, **_LK)  # type: ignore[call-overload]
     off = np.linalg.norm((back - start).reshape(-1, 2), axis=1)
     kept = (is_found.ravel() == 1) & (is_back.ravel() == 1) & (off <= MAX_RETURN_PX)
     return there.reshape(-1, 2), kept

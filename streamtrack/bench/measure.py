@@ -31,7 +31,7 @@ _WARM_UP_FRAMES = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sequence_:
+class Footage:
     """A sequence that was run: what it was, without its pictures.
 
     ``decode_ms`` (N,) is the time to read each frame from an H.264 file, None without an encoder.
@@ -57,7 +57,7 @@ class Trial:
     """
 
     method: Method
-    sequence: Sequence_
+    footage: Footage
     quads: tuple[Points | None, ...]
     cpu_ms: Floats
     stages_ms: tuple[dict[str, float], ...]
@@ -127,7 +127,7 @@ def _run_sequence(
     should_stop: Callable[[], bool],
 ) -> list[Trial]:
     height, width = clip.images[0].shape[:2]
-    sequence = Sequence_(
+    footage = Footage(
         scenario.name,
         scenario.group,
         scenario.factor,
@@ -144,7 +144,7 @@ def _run_sequence(
         gc.collect()
         with memory.growth() as growth:
             quads, cpu_ms, stages, refusal = _follow(method, clip, should_stop)
-        trials.append(Trial(method, sequence, quads, cpu_ms, stages, growth.mb, refusal))
+        trials.append(Trial(method, footage, quads, cpu_ms, stages, growth.mb, refusal))
     return trials
 
 

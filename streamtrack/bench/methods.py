@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Self
@@ -72,11 +71,6 @@ class Streamtrack(Follower):
         self.stage_ms = step.stage_ms
         return step.tracks[0].quad
 
-    def close(self) -> None:
-        """End the loop."""
-        with closing(self._steps):
-            pass
-
 
 def _streamtrack(name: str, title: str, values: dict[str, Any]) -> Method:
     settings = build_settings(values)
@@ -103,9 +97,9 @@ _ALL = (
         "plane-tracker",
         "OpenCV plane_tracker",
         peers.PlaneTracker,
-        peers.PlaneTracker.PARAMETERS,
+        peers.PLANE_TRACKER_PARAMETERS,
     ),
-    Method("lk-chain", "LK chain", peers.LucasKanadeChain, peers.LucasKanadeChain.PARAMETERS),
+    Method("lk-chain", "LK chain", peers.LucasKanadeChain, peers.CHAIN_PARAMETERS),
     Method("prewarp-lk", "Pre-warp LK", prewarp.PreWarpLK, prewarp.PARAMETERS),
     Method("prewarp-dis", "Pre-warp DIS", prewarp.PreWarpDIS, prewarp.PARAMETERS),
     Method("csrt", "CSRT (box)", peers.csrt, {"parameters": "OpenCV's defaults"}, is_box=True),

@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 
 from streamtrack.bench.follower import (
+    LK_WINDOW_PX,
+    MAX_RETURN_PX,
     Follower,
     bgr_of,
     corners_in,
@@ -21,6 +23,29 @@ from streamtrack.bench.follower import (
 from streamtrack.geometry import bounding_box, box_quad
 from streamtrack.types import Image, Matrix, Points
 
+_ORB_FEATURES = 1000
+_MAX_RATIO = 0.75
+_RANSAC_PX = 3.0
+_MIN_INLIERS = 10
+_CHAIN_POINTS = 400
+_SOW_BELOW = 150
+PLANE_TRACKER_PARAMETERS = {
+    "detector": "orb",
+    "features": _ORB_FEATURES,
+    "matcher": "brute force",
+    "max_ratio": _MAX_RATIO,
+    "ransac_px": _RANSAC_PX,
+    "min_matches": _MIN_INLIERS,
+}
+CHAIN_PARAMETERS = {
+    "points": _CHAIN_POINTS,
+    "sow_below": _SOW_BELOW,
+    "window_px": LK_WINDOW_PX,
+    "max_return_px": MAX_RETURN_PX,
+    "ransac_px": _RANSAC_PX,
+    "min_inliers": _MIN_INLIERS,
+}
+
 
 class PlaneTracker(Follower):
     """OpenCV's samples/python/plane_tracker.py: ORB 1000, ratio 0.75, RANSAC 3 px, >= 10 matches.
@@ -29,10 +54,8 @@ class PlaneTracker(Follower):
     to the same question, and the same in every run. The target is the quad, not its bounding box.
     """
 
-    PARAMETERS = {"features": 1000, "max_ratio": 0.75, "ransac_px": 3.0, "min_matches": 10}
-
     def __init__(self, image: Image, quad: Points) -> None:
-        self._orb = cv2.ORB.create(nfeatures=1000)
+        self._orb = cv2.ORB.create(nfeatures=_ORB_FEATURES)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
         self._quad = quad
         points, descriptors = self._orb.detectAndCompute(grey_of(image), None)
@@ -46,21 +69,21 @@ class PlaneTracker(Follower):
 
     def update(self, image: Image) -> Points | None:
         points, descriptors = self._orb.detectAndCompute(grey_of(image), None)
-        if len(points) < 10 or len(self._points) < 10:
+        if len(points) < _MIN_INLIERS or len(self._points) < _MIN_INLIERS:
             return None
         pairs = [
             best
             for best, *second in self._matcher.knnMatch(descriptors, self._descriptors, k=2)
-            if second and best.distance < 0.75 * second[0].distance
+            if second and best.distance < _MAX_RATIO * second[0].distance
         ]
-        if len(pairs) < 10:
+        if len(pairs) < _MIN_INLIERS:
             return None
         source = self._points[[pair.trainIdx for pair in pairs]]
         found = np.array([points[pair.queryIdx].pt for pair in pairs], np.float32)
-        matrix, is_inlier = cv2.findHomography(source, found, cv2.RANSAC, 3.0)
-        if matrix is None or int(is_inlier.sum()) < 10:
+        matrix, is_inlier = cv2.findHomography(source, found, cv2.RANSAC, _RANSAC_PX)
+        if matrix is None or int(is_inlier.sum()) < _MIN_INLIERS:
             return None
-        return mapped(matrix, self._quad)
+        return mapped(np.asarray(matrix, np.float64), self._quad)
 
 
 class LucasKanadeChain(Follower):
@@ -70,8 +93,6 @@ class LucasKanadeChain(Follower):
     the pose of that moment: from there on errors add up. A frame that fails is left out, and the
     next one is measured against the last good one.
     """
-
-    PARAMETERS = {"points": 400, "sow_below": 150, "window": 21, "levels": 3, "ransac_px": 3.0}
 
     def __init__(self, image: Image, quad: Points) -> None:
         self._quad = quad
@@ -84,17 +105,17 @@ class LucasKanadeChain(Follower):
     def update(self, image: Image) -> Points | None:
         grey = grey_of(image)
         found, is_found = lucas_kanade(self._grey, grey, self._points)
-        if int(is_found.sum()) < 10:
+        if int(is_found.sum()) < _MIN_INLIERS:
             return None
         source, found = self._first_points[is_found], found[is_found]
-        matrix, inliers = cv2.findHomography(source, found, cv2.RANSAC, 3.0)
-        if matrix is None or int(inliers.sum()) < 10:
+        matrix, inliers = cv2.findHomography(source, found, cv2.RANSAC, _RANSAC_PX)
+        if matrix is None or int(inliers.sum()) < _MIN_INLIERS:
             return None
         kept = inliers.ravel().astype(bool)
         self._pose = np.asarray(matrix, np.float64)
         self._grey = grey
         self._first_points, self._points = source[kept], found[kept]
-        if len(self._points) < self.PARAMETERS["sow_below"]:
+        if len(self._points) < _SOW_BELOW:
             self._sow()
         return mapped(self._pose, self._quad)
 
@@ -103,9 +124,10 @@ class LucasKanadeChain(Follower):
         mask = quad_mask(mapped(self._pose, self._quad), self._grey.shape, 2)
         for x, y in np.rint(self._points).astype(int):
             cv2.circle(mask, (int(x), int(y)), 5, 0, -1)
-        most = int(self.PARAMETERS["points"]) - len(self._points)
+        most = _CHAIN_POINTS - len(self._points)
         new = corners_in(self._grey, mask, most, 5.0)
-        first = mapped(np.linalg.inv(self._pose), new)
+        first_from_frame: Matrix = np.linalg.inv(self._pose)
+        first = mapped(first_from_frame, new)
         self._points = np.vstack([self._points, new])
         self._first_points = np.vstack([self._first_points, first])
 

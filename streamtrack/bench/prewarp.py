@@ -174,7 +174,9 @@ class _Detector:
         found = self._orb.detect(grey, mask)
         found, descriptors = self._teblid.compute(grey, found)
         points = np.array([point.pt for point in found], np.float32).reshape(-1, 2)
-        return points, np.zeros((0, 32), np.uint8) if descriptors is None else descriptors
+        if descriptors is None:
+            return points, np.zeros((0, 32), np.uint8)
+        return points, np.asarray(descriptors, np.uint8)
 
 
 def _homography(source: Points, found: Points) -> tuple[Matrix, int] | None:

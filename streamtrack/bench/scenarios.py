@@ -44,8 +44,16 @@ _PHOTOS = (
 FRAMES = 150
 """Enough for every scene to show what it is made for: in ``absence`` the target is back at 130."""
 QUICK_FRAMES = {
-    **{"scale": 80, "perspective": 80, "blur": 50, "unconstrained": 100, "absence": 140},
-    **{"fullocclusion": 110, "weak": 50, "small": 50, "fast": 50, "static": 40},
+    "scale": 80,
+    "perspective": 80,
+    "blur": 50,
+    "unconstrained": 100,
+    "absence": 140,
+    "fullocclusion": 110,
+    "weak": 50,
+    "small": 50,
+    "fast": 50,
+    "static": 40,
 }
 MIN_VISIBLE = 0.2
 ABSENT_BELOW = 0.02
@@ -84,7 +92,7 @@ class Clip:
 
     @property
     def first_quad(self) -> Points:
-        return self.truth.quads[0].astype(np.float32)
+        return np.asarray(self.truth.quads[0], np.float32)
 
 
 class Scenario(Protocol):

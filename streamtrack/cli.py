@@ -34,6 +34,13 @@ app = typer.Typer(
 _DETECTORS = "harris, fast, agast, gftt, brisk, orb, sift, akaze"
 _DESCRIPTORS = "freak, brisk, orb, teblid, sift, akaze"
 
+bench_app = typer.Typer(
+    help="Measure accuracy and cost on sequences with known truth, against peers.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+app.add_typer(bench_app, name="bench")
+
 
 def main() -> None:
     """Run the program."""
@@ -196,6 +203,47 @@ def view(
     from streamtrack.viewer import view as open_viewer
 
     raise typer.Exit(open_viewer(recording, web=web, port=port))
+
+
+@bench_app.command("track")
+def bench_track(
+    quick: Annotated[
+        bool, typer.Option("--quick", help="A reduced set, in about a minute.")
+    ] = False,
+    scenes: Annotated[
+        str | None,
+        typer.Option(help="Scenes of synthetic://, as blur,static; none for --pot alone."),
+    ] = None,
+    seeds: Annotated[str | None, typer.Option(help="Seeds of each scene; default 1,2,3.")] = None,
+    methods: Annotated[
+        str | None,
+        typer.Option(
+            help="streamtrack, harris-freak, sift, brisk, plane-tracker, lk-chain, prewarp-lk, "
+            "prewarp-dis, csrt, kcf; default all."
+        ),
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=3, help="Frames of each sequence; default 150.")
+    ] = None,
+    pot: Annotated[
+        Path | None, typer.Option(help="Folder of POT sequences, to be run as well.")
+    ] = None,
+    json_path: Annotated[
+        Path | None, typer.Option("--json", help="Everything that was measured, as JSON.")
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(help="Accuracy over cost, as PNG.")] = None,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="The factors of every method.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Tell no progress.")] = False,
+) -> None:
+    """Track sequences with known truth by streamtrack and its peers, on the very same frames."""
+    from streamtrack.bench.command import Request, run_request, tell_on
+
+    console, errors = _consoles()
+    request = Request(quick, scenes, seeds, methods, frames, pot, json_path, plot, verbose)
+    with _warnings_shown(errors, quiet), _StopOnSignal() as stop:
+        run_request(request, console, (lambda _line: None) if quiet else tell_on(errors), stop)
 
 
 def _settings(path: Path | None, flags: dict[str, Any]) -> Settings:

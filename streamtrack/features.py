@@ -105,11 +105,26 @@ class FeatureExtractor:
             return self._extract_from_pyramid(grey, mask)
         return self._extract_with_own_scale(grey, mask)
 
-    def _extract_from_pyramid(self, grey: Image, mask: Image | None) -> Features:
+    def extract_half(self, grey: Image, phase: int) -> Features:
+        """About half of what `extract` would find, at half the cost; ``phase`` says which half.
+
+        Even phases see the finest level of the pyramid, odd ones all others, so that a search
+        over several frames sees everything and no frame takes long. Detectors with a scale of
+        their own cannot be halved and give all.
+        """
+        if self._settings.detector not in _CORNERS or min(grey.shape) < _MIN_PICTURE_PX:
+            return self.extract(grey)
+        levels = slice(0, 1) if phase % 2 == 0 else slice(1, None)
+        found = self._extract_from_pyramid(grey, None, levels)
+        return found if len(found) else self.extract(grey)
+
+    def _extract_from_pyramid(
+        self, grey: Image, mask: Image | None, chosen: slice = slice(None)
+    ) -> Features:
         levels = _pyramid(grey)
         quotas = _quotas(len(levels), self._settings.max_features)
         parts = []
-        for (level, full_from_level), quota in zip(levels, quotas, strict=True):
+        for (level, full_from_level), quota in zip(levels[chosen], quotas[chosen], strict=True):
             found = self._describe_corners(level, _resized_mask(mask, level), quota)
             factor = np.float32(full_from_level[0, 0])
             parts.append(

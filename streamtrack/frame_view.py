@@ -18,6 +18,7 @@ class FrameView:
         self._extractor = extractor
         self.pyramid = Pyramid(geometry.grey_of(frame.image))
         self._features: Features | None = None
+        self._some: Features | None = None
         self.detect_ms = 0.0
 
     @property
@@ -34,10 +35,20 @@ class FrameView:
         if self._features is None:
             start = time.perf_counter()
             self._features = self._extractor.extract(self.grey)
-            self.detect_ms = (time.perf_counter() - start) * 1e3
+            self.detect_ms += (time.perf_counter() - start) * 1e3
         return self._features
+
+    def some_features(self) -> Features:
+        """Half of the frame's features, the other half in the next frame; all if known already."""
+        if self._features is not None:
+            return self._features
+        if self._some is None:
+            start = time.perf_counter()
+            self._some = self._extractor.extract_half(self.grey, self.frame.index)
+            self.detect_ms += (time.perf_counter() - start) * 1e3
+        return self._some
 
     @property
     def detected(self) -> Features | None:
-        """The features if any stage asked for them, else None."""
-        return self._features
+        """The features that any stage asked for, else None."""
+        return self._some if self._features is None else self._features

@@ -28,6 +28,7 @@ from streamtrack.settings import Settings
 from streamtrack.template import Template
 from streamtrack.types import (
     Evidence,
+    Features,
     Matches,
     Matrix,
     Model,
@@ -40,6 +41,7 @@ from streamtrack.types import (
 
 _GUIDED_RADIUS_PX = 60.0
 _COAST_FRAMES = 10
+_FULL_SEARCH_EVERY = 12
 _FIRST_SURPRISE_PX = 5.0
 _MIN_SURPRISE_PX = 1.0
 _SURPRISE_RATE = 0.2
@@ -69,8 +71,7 @@ class DetectTracker:
     def update(self, view: FrameView) -> Track:
         features = view.features()
         matches = match(self.template.features, features, self._settings.matching)
-        found = _register_features(self.template, view, matches, self._settings)
-        evidence = _feature_evidence(self.template, view, matches, found)
+        found, evidence = _register_features(self.template, view, features, matches, self._settings)
         self._was_seen |= found.verdict is Verdict.OK
         return make_track(self.template, found, evidence, "detect", self._was_seen)
 
@@ -147,9 +148,12 @@ class HybridTracker:
         return replace(alignment, registration=refusal)
 
     def _detect(self, view: FrameView) -> tuple[Registration, Evidence, str]:
-        """By features: near the last place while the loss is fresh, else everywhere."""
-        features = view.features()
+        """By features: near the last place in the first lost frame, then everywhere.
+
+        Once lost, most frames see only half of the features each, so that none takes long.
+        """
         if self._pose is not None and self._frames_lost == 0:
+            features = view.features()
             predicted = geometry.transform_points(self._pose, self.template.features.points)
             matches = match_guided(
                 self.template.features,
@@ -158,12 +162,15 @@ class HybridTracker:
                 _GUIDED_RADIUS_PX,
                 self._settings.matching,
             )
-            found = _register_features(self.template, view, matches, self._settings)
-            if found.verdict is Verdict.OK:
-                return found, _feature_evidence(self.template, view, matches, found), "guided"
+            found, evidence = _register_features(
+                self.template, view, features, matches, self._settings
+            )
+            return found, evidence, "guided"
+        sees_all = not self._was_seen or self._frames_lost % _FULL_SEARCH_EVERY == 1
+        features = view.features() if sees_all else view.some_features()
         matches = match(self.template.features, features, self._settings.matching)
-        found = _register_features(self.template, view, matches, self._settings)
-        return found, _feature_evidence(self.template, view, matches, found), "global"
+        found, evidence = _register_features(self.template, view, features, matches, self._settings)
+        return found, evidence, "global"
 
     def _tracked(self, alignment: Alignment, means: str) -> Track:
         found = alignment.registration
@@ -186,7 +193,7 @@ class HybridTracker:
 def _shared_motion(model: Model, quad: Points, before: Matrix, after: Matrix) -> Matrix:
     """What carried the quad from one frame to the next, for the prediction.
 
-    A similarity's four freedoms extrapolate well; the perspective ones would mostly extrapolate noise.
+    Few freedoms extrapolate well; those of perspective would mostly extrapolate noise.
     """
     return fit(
         model,
@@ -196,26 +203,16 @@ def _shared_motion(model: Model, quad: Points, before: Matrix, after: Matrix) ->
 
 
 def _register_features(
-    template: Template, view: FrameView, matches: Matches, settings: Settings
-) -> Registration:
+    template: Template, view: FrameView, features: Features, matches: Matches, settings: Settings
+) -> tuple[Registration, Evidence]:
+    """frame_from_template from matched features, and the pairs it rests on."""
     width, height = view.size_wh
-    return register(
-        template.features.points[matches.ref],
-        view.features().points[matches.cur],
-        settings.registration,
-        template.quad,
-        float(width * height),
+    template_points = template.features.points[matches.ref]
+    frame_points = features.points[matches.cur]
+    found = register(
+        template_points, frame_points, settings.registration, template.quad, float(width * height)
     )
-
-
-def _feature_evidence(
-    template: Template, view: FrameView, matches: Matches, found: Registration
-) -> Evidence:
-    return Evidence(
-        template.features.points[matches.ref],
-        view.features().points[matches.cur],
-        found.is_inlier,
-    )
+    return found, Evidence(template_points, frame_points, found.is_inlier)
 
 
 def make_track(

@@ -20,7 +20,7 @@ from streamtrack.bench.follower import (
     mapped,
     quad_mask,
 )
-from streamtrack.geometry import bounding_box, box_quad
+from streamtrack.geometry import bounding_box, box_quad, inverted
 from streamtrack.types import Image, Matrix, Points
 
 _ORB_FEATURES = 1000
@@ -126,7 +126,7 @@ class LucasKanadeChain(Follower):
             cv2.circle(mask, (int(x), int(y)), 5, 0, -1)
         most = _CHAIN_POINTS - len(self._points)
         new = corners_in(self._grey, mask, most, 5.0)
-        first_from_frame: Matrix = np.linalg.inv(self._pose)
+        first_from_frame = inverted(self._pose)
         first = mapped(first_from_frame, new)
         self._points = np.vstack([self._points, new])
         self._first_points = np.vstack([self._first_points, first])

@@ -44,16 +44,16 @@ _PHOTOS = (
 FRAMES = 150
 """Enough for every scene to show what it is made for: in ``absence`` the target is back at 130."""
 QUICK_FRAMES = {
-    "scale": 80,
-    "perspective": 80,
-    "blur": 50,
-    "unconstrained": 100,
-    "absence": 140,
-    "fullocclusion": 110,
-    "weak": 50,
-    "small": 50,
-    "fast": 50,
-    "static": 40,
+    "scale": 60,
+    "perspective": 50,
+    "blur": 40,
+    "unconstrained": 90,
+    "absence": 135,
+    "fullocclusion": 105,
+    "weak": 40,
+    "small": 40,
+    "fast": 40,
+    "static": 30,
 }
 MIN_VISIBLE = 0.2
 ABSENT_BELOW = 0.02

@@ -1,4 +1,4 @@
-"""Track objects and build mosaics from video.
+"""Track objects in video by local features and homographies.
 
     from streamtrack import open_source, parse_targets, track
 

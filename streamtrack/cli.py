@@ -31,6 +31,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+_PIPED_WIDTH = 200
 _DETECTORS = "harris, fast, agast, gftt, brisk, orb, sift, akaze"
 _DESCRIPTORS = "freak, brisk, orb, teblid, sift, akaze"
 
@@ -46,18 +47,27 @@ def main() -> None:
     """Run the program."""
     # Rerun's own log lines: what matters of them is said in ours, in one line.
     os.environ.setdefault("RUST_LOG", "off")
-    exit_on_error(app)
+    exit_on_error(lambda: app(standalone_mode=False))
 
 
 def exit_on_error(run: Callable[[], Any]) -> None:
     """Call ``run``; exit with 2 for wrong usage and 1 for any failure, each said in one line."""
+    from typer.exceptions import Abort, TyperException
+
     try:
-        run()
+        result = run()
+        if isinstance(result, int):
+            sys.exit(result)
+    except TyperException as error:
+        if not sys.argv[1:]:
+            sys.stderr.write(f"{error.format_message()}\n")  # the help
+            sys.exit(error.exit_code)
+        _fail(f"{error.format_message().rstrip('.')}; see streamtrack --help", error.exit_code)
     except UsageError as error:
         _fail(error, 2)
     except StreamtrackError as error:
         _fail(error, 1)
-    except KeyboardInterrupt:
+    except (Abort, KeyboardInterrupt):
         _fail("interrupted", 1)
     except BrokenPipeError:
         # Nobody reads our output any more; keep Python from complaining while it shuts down.
@@ -190,7 +200,10 @@ def synth(
     """Write a synthetic sequence and its exact truth to files."""
     from streamtrack.synth import write_synthetic
 
-    write_synthetic(uri, output, truth)
+    with _StopOnSignal() as stop:
+        written = write_synthetic(uri, output, truth, stop)
+    if stop():
+        raise StreamtrackError(f"interrupted after {written} frames: these are written")
 
 
 @app.command()
@@ -253,8 +266,9 @@ def _settings(path: Path | None, flags: dict[str, Any]) -> Settings:
     for section, value in flags.items():
         if isinstance(value, dict):
             given = {name: item for name, item in value.items() if item is not None}
-            if given:
-                values[section] = {**values.get(section, {}), **given}
+            in_file = values.get(section, {})
+            if given and isinstance(in_file, dict):
+                values[section] = {**in_file, **given}
         elif value is not None:
             values[section] = value
     return build_settings(values)
@@ -265,13 +279,20 @@ def _default_recording(source: str) -> Path:
 
     stem = Path(SourceInfo(source, (0, 0), None, None).name).stem or "source"
     safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in stem)
-    return Path("recordings") / f"{safe}-{time.strftime('%Y%m%d-%H%M%S')}.rrd"
+    first = Path("recordings") / f"{safe}-{time.strftime('%Y%m%d-%H%M%S')}.rrd"
+    path, number = first, 1
+    while path.exists():
+        number += 1
+        path = first.with_stem(f"{first.stem}-{number}")
+    return path
 
 
 def _consoles() -> tuple[Console, Console]:
     from rich.console import Console
 
-    return Console(), Console(stderr=True)
+    # Piped, a table must not be wrapped, so that it can be searched.
+    output = Console() if sys.stdout.isatty() else Console(width=_PIPED_WIDTH)
+    return output, Console(stderr=True)
 
 
 @contextmanager
@@ -309,7 +330,10 @@ def _print_summary(console: Console, rows: list[tuple[str, str]], record: Path |
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for label, value in rows:
         table.add_row(Text(label, style="bold"), Text(value))
-    console.print(table)
+    with console.capture() as capture:
+        console.print(table)
+    for line in capture.get().splitlines():
+        console.file.write(line.rstrip() + "\n")
     if record is not None:
         console.print(Text(f"\nOpen the recording: streamtrack view {record}"), soft_wrap=True)
 

@@ -105,16 +105,16 @@ class FeatureExtractor:
             return self._extract_from_pyramid(grey, mask)
         return self._extract_with_own_scale(grey, mask)
 
-    def extract_half(self, grey: Image, phase: int) -> Features:
-        """About half of what `extract` would find, at half the cost; ``phase`` says which half.
+    def extract_half(self, grey: Image, half: int) -> Features:
+        """About half of what `extract` would find, at half the cost; ``half`` says which.
 
-        Even phases see the finest level of the pyramid, odd ones all others, so that a search
+        Even ones see the finest level of the pyramid, odd ones all others, so that a search
         over several frames sees everything and no frame takes long. Detectors with a scale of
         their own cannot be halved and give all.
         """
         if self._settings.detector not in _CORNERS or min(grey.shape) < _MIN_PICTURE_PX:
             return self.extract(grey)
-        levels = slice(0, 1) if phase % 2 == 0 else slice(1, None)
+        levels = slice(0, 1) if half % 2 == 0 else slice(1, None)
         found = self._extract_from_pyramid(grey, None, levels)
         return found if len(found) else self.extract(grey)
 

@@ -18,7 +18,14 @@ from streamtrack import geometry
 from streamtrack.blur import fitted_length, motion_blur
 from streamtrack.frame_view import FrameView
 from streamtrack.refine import Prior, refined
-from streamtrack.registration import Effort, judge_mapping, poorest_model, refused, register
+from streamtrack.registration import (
+    Effort,
+    judge_mapping,
+    poorest_model,
+    refused,
+    register,
+    transfer_errors,
+)
 from streamtrack.settings import RegistrationSettings
 from streamtrack.template import Patch, Template
 from streamtrack.types import Image, Mask, Matrix, Model, Points, Registration, Verdict
@@ -70,8 +77,9 @@ class FlowAligner:
     def __init__(self, template: Template, settings: RegistrationSettings) -> None:
         self._template = template
         self._settings = settings
-        self._coarse_flow = _make_flow(finest_scale=1)
-        self._fine_flow = _make_flow(finest_scale=1)
+        # Two, because DIS keeps buffers of the size it last saw.
+        self._coarse_flow = _make_flow()
+        self._fine_flow = _make_flow()
 
     def align(self, view: FrameView, guess: Matrix, sigma_px: float | None = None) -> Alignment:
         """The pose near ``guess`` (frame_from_template): first coarse, then fine, then refined.
@@ -129,8 +137,13 @@ class FlowAligner:
         )
         if pose is None or judge_mapping(pose, self._template.quad) is not Verdict.OK:
             pose = registration.b_from_a
-        model = poorest_model(pose, self._template.quad)
-        return replace(found, registration=replace(registration, b_from_a=pose, model=model))
+        errors = transfer_errors(pose, found.template_points, found.frame_points)
+        rmse_px = float(np.sqrt(np.mean(errors[registration.is_inlier] ** 2)))
+        model = registration.model
+        if self._settings.model == "auto":
+            model = poorest_model(pose, self._template.quad)
+        refinement = replace(registration, b_from_a=pose, model=model, rmse_px=rmse_px)
+        return replace(found, registration=refinement)
 
     def _shown(self, patch: Patch, found: Alignment) -> Mask:
         """Which gradient pixels (N,) show the target: those whose nearest point is an inlier."""
@@ -221,9 +234,9 @@ def patch_for(template: Template, frame_from_template: Matrix) -> int:
     return len(template.patches) - 1
 
 
-def _make_flow(finest_scale: int) -> cv2.DISOpticalFlow:
+def _make_flow() -> cv2.DISOpticalFlow:
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
-    flow.setFinestScale(finest_scale)
+    flow.setFinestScale(1)
     flow.setPatchSize(8)
     flow.setPatchStride(4)
     flow.setGradientDescentIterations(16)

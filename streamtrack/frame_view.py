@@ -18,7 +18,7 @@ class FrameView:
         self._extractor = extractor
         self.pyramid = Pyramid(geometry.grey_of(frame.image))
         self._features: Features | None = None
-        self._some: Features | None = None
+        self._halves: dict[int, Features] = {}
         self.detect_ms = 0.0
 
     @property
@@ -38,17 +38,19 @@ class FrameView:
             self.detect_ms += (time.perf_counter() - start) * 1e3
         return self._features
 
-    def some_features(self) -> Features:
-        """Half of the frame's features, the other half in the next frame; all if known already."""
+    def half_of_features(self, half: int) -> Features:
+        """Even or odd ``half`` of the frame's features; all if they are known already."""
         if self._features is not None:
             return self._features
-        if self._some is None:
+        if half % 2 not in self._halves:
             start = time.perf_counter()
-            self._some = self._extractor.extract_half(self.grey, self.frame.index)
+            self._halves[half % 2] = self._extractor.extract_half(self.grey, half)
             self.detect_ms += (time.perf_counter() - start) * 1e3
-        return self._some
+        return self._halves[half % 2]
 
     @property
     def detected(self) -> Features | None:
         """The features that any stage asked for, else None."""
-        return self._some if self._features is None else self._features
+        if self._features is not None or not self._halves:
+            return self._features
+        return max(self._halves.values(), key=len)

@@ -11,7 +11,7 @@ from streamtrack.types import Image, Matrix, Points, Size
 def transform_points(b_from_a: Matrix, points: npt.ArrayLike) -> Points:
     """Map points (N, 2) of a into b, float32 (N, 2).
 
-    Points on the horizon of the mapping come out as inf or NaN; `is_sane_quad` catches them.
+    Points on the horizon come out as inf or NaN; `registration.judge_mapping` refuses those.
     """
     pts = np.asarray(points, np.float64).reshape(-1, 2)
     mapped = pts @ b_from_a[:, :2].T + b_from_a[:, 2]

@@ -13,7 +13,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from streamtrack.errors import OutputError, SourceError, StreamtrackError
+from streamtrack.errors import OutputError, SourceError, StreamtrackError, UsageError
 from streamtrack.pipeline import track
 from streamtrack.results import PosesWriter, check_tracks_path, open_tracks_writer
 from streamtrack.settings import Settings
@@ -74,12 +74,11 @@ def run_track(job: TrackJob, progress: Progress, should_stop: Callable[[], bool]
 
     Raises StreamtrackError if it cannot even start, or an output cannot be closed.
     """
+    _check_outputs(job)
     with ExitStack() as stack:
         source = stack.enter_context(
             open_source(job.source, with_packets=job.outputs.record is not None)
         )
-        if job.outputs.tracks is not None:
-            check_tracks_path(job.outputs.tracks)
         builder = SummaryBuilder(source.info, job.settings)
         steps = stack.enter_context(closing(_steps(job, source)))
         # A target that does not fit the first frame is refused before any output is touched.
@@ -89,7 +88,7 @@ def run_track(job: TrackJob, progress: Progress, should_stop: Callable[[], bool]
         watchers, finish = _open_watchers(job, source, stack)
         progress.begin(source.info, _expected_frames(job, source.info))
         error: StreamtrackError | None = None
-        ended = "end of source"
+        ended = ""
         try:
             for step in chain([first], steps):
                 for watch in watchers:
@@ -102,9 +101,38 @@ def run_track(job: TrackJob, progress: Progress, should_stop: Callable[[], bool]
                     break
         except StreamtrackError as raised:
             error, ended = raised, str(raised)
-        summary = builder.build(source.skipped, source.corrupt_packets, ended)
-        error = finish(summary) or error
+        summary = builder.build(
+            source.skipped, source.corrupt_packets, ended or _natural_end(job, builder.frames)
+        )
+        failure = finish(summary)
+        error = error or failure
     return Outcome(summary, error)
+
+
+def _check_outputs(job: TrackJob) -> None:
+    """Refuse, before anything is opened, outputs that would replace each other or the source."""
+    outputs = job.outputs
+    if outputs.tracks is not None:
+        check_tracks_path(outputs.tracks)
+    if outputs.record is not None and outputs.record.suffix != ".rrd":
+        raise UsageError(f"recording {outputs.record}: give it the ending .rrd")
+    sources = [job.source] if isinstance(job.source, str) else job.source
+    taken = {Path(source).resolve(): f"the source {source}" for source in sources}
+    for name in ("record", "tracks", "poses", "video", "summary"):
+        path = getattr(outputs, name)
+        if path is None:
+            continue
+        if path.resolve() in taken and path.name and not _is_device(path):
+            raise UsageError(f"{path} would replace {taken[path.resolve()]}: name another file")
+        taken[path.resolve()] = f"the {name} output"
+
+
+def _natural_end(job: TrackJob, frames: int) -> str:
+    return f"{frames} frames, as asked" if frames == job.frames else "end of source"
+
+
+def _is_device(path: Path) -> bool:
+    return path.exists() and not path.is_file()
 
 
 def _steps(job: TrackJob, source: FrameSource) -> Generator[Step]:
@@ -151,13 +179,18 @@ def _open_watchers(
         finishers.append(lambda summary: recorder.close(summary.to_markdown()))
 
     def finish(summary: Summary) -> StreamtrackError | None:
+        failure: StreamtrackError | None = None
         for finisher in finishers:
-            finisher(summary)
-        if recorder is None or recorder.failed is None:
-            return None
-        return OutputError(
-            f"the recording {recorder.path} ended early ({recorder.failed}); all else is complete"
-        )
+            try:
+                finisher(summary)
+            except StreamtrackError as error:
+                failure = failure or error
+        if failure is None and recorder is not None and recorder.failed is not None:
+            failure = OutputError(
+                f"the recording {recorder.path} ended early ({recorder.failed}); "
+                "all else is complete"
+            )
+        return failure
 
     return watchers, finish
 

@@ -38,15 +38,19 @@ def target_color(index: int) -> Color:
 class Trails:
     """The last ``length`` centres of each tracked target, carried along with a moving camera.
 
-    A trail starts anew when its target is lost or the camera's place becomes unknown.
+    A trail starts anew when its target is lost, the camera's place becomes unknown or the
+    picture changes its size.
     """
 
     def __init__(self, length: int = 45) -> None:
         self._length = length
         self._world: dict[str, deque[npt.NDArray[np.float64]]] = {}
+        self._size_wh: Size | None = None
 
     def follow(self, step: Step) -> dict[str, Points]:
         """Take in one frame; centres by target name, (N, 2) px of this frame, oldest first."""
+        if step.frame.size_wh != self._size_wh:
+            self._world, self._size_wh = {}, step.frame.size_wh
         world_from_frame = step.camera.world_from_frame
         tracked = {track.name: track for track in step.tracks if track.quad is not None}
         if world_from_frame is None:

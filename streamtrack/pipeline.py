@@ -10,7 +10,7 @@ import numpy as np
 
 from streamtrack import geometry
 from streamtrack.camera import make_camera
-from streamtrack.errors import UsageError
+from streamtrack.errors import TargetError, UsageError
 from streamtrack.features import FeatureExtractor
 from streamtrack.frame_view import FrameView
 from streamtrack.settings import Settings
@@ -85,8 +85,15 @@ def make_tracker(
     picture = view.frame.image if target.picture is None else target.picture
     size_wh = (picture.shape[1], picture.shape[0])
     quad = geometry.image_quad(size_wh) if target.quad is None else target.quad
-    check_quad_in_picture(target.name, quad, size_wh)
+    where = "the first frame" if target.picture is None else "the template picture"
+    check_quad_in_picture(target.name, quad, size_wh, where)
     template = make_template(target.name, picture, quad, extractor)
+    found, needed = len(template.features), settings.registration.min_inliers
+    if found < needed and (settings.tracker.method == "detect" or target.picture is not None):
+        raise TargetError(
+            f"target '{target.name}' has only {found} features, {needed} needed: lower "
+            "--threshold, choose another detector, or a larger or more structured region"
+        )
     first_pose = np.eye(3) if target.picture is None else None
     if settings.tracker.method == "detect":
         return DetectTracker(template, settings)

@@ -206,7 +206,7 @@ class Recorder:
         """Points and lines of all targets, in one batch each; the important ones drawn last."""
         evidence = [track.evidence for track in step.tracks]
         loose = [one.unmatched_points for one in evidence]
-        if step.features is not None:
+        if step.features is not None and not any(len(points) for points in loose):
             loose.append(step.features.points)
         found = [one.frame_points for one in evidence]
         points = np.concatenate([*loose, *found]) if loose else np.zeros((0, 2), np.float32)

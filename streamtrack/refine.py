@@ -31,9 +31,6 @@ _CONVERGED_PX = 0.02
 _MAX_MOVE_SHARE = 0.1
 _SAMPLE_STEP = 4
 
-_INDEPENDENT_SHARE = 1.0
-"""Neighbouring residuals are correlated: so much information a pixel, against independent ones."""
-
 _BASES = {
     Model.TRANSLATION: np.eye(8)[:, [2, 5]],
     Model.SIMILARITY: np.stack(
@@ -144,7 +141,7 @@ def _normal_equations(jacobian: Floats, values: Floats, seen: Floats) -> tuple[D
     residual = np.float32(min(3.0, max(0.4, gain))) * seen - values
     noise = 1.4826 * _median_size(residual) + 1.0
     weights = np.maximum(0, 1 - (residual * np.float32(1 / (4.685 * noise))) ** 2) ** 2
-    weighted = jacobian * (weights * np.float32(_INDEPENDENT_SHARE / noise**2))[:, None]
+    weighted = jacobian * (weights * np.float32(1 / noise**2))[:, None]
     normal = (weighted.T @ jacobian).astype(np.float64)
     normal[np.diag_indices(len(normal))] *= 1 + 1e-6
     return normal, (weighted.T @ residual).astype(np.float64)

@@ -81,7 +81,7 @@ class RegistrationSettings(_Section):
     model: ModelChoice = "auto"
     inlier_threshold_px: float = Field(default=3.0, gt=0, allow_inf_nan=False)
     min_inliers: int = Field(default=10, ge=4)
-    seed: int = 1
+    seed: int = Field(default=1, ge=0, le=2**31 - 1)
 
 
 class TrackerSettings(_Section):
@@ -135,13 +135,24 @@ def build_settings(values: dict[str, Any]) -> Settings:
         if first["type"] in ("literal_error", "enum") and last in _NAMES:
             raise unknown_name(last, str(first["input"]), _NAMES[last]) from None
         if first["type"] == "extra_forbidden":
-            raise UsageError(f"unknown setting '{place}': see README, 'Settings'") from None
+            raise unknown_name("setting", place, _setting_names()) from None
         raise UsageError(f"setting {place} = {first['input']!r}: {first['msg']}") from None
+
+
+def _setting_names() -> list[str]:
+    sections = {name: getattr(Settings(), name) for name in Settings.model_fields}
+    return [
+        f"{name}.{key}" if isinstance(section, _Section) else name
+        for name, section in sections.items()
+        for key in (type(section).model_fields if isinstance(section, _Section) else [""])
+    ]
 
 
 def read_settings_file(path: Path) -> dict[str, Any]:
     """Nested values of a TOML settings file. Raises UsageError if it cannot be read."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise UsageError(f"settings file {path}: {error}") from None
+    except OSError as error:
+        raise UsageError(f"settings file {path}: {error.strerror}; check the path") from None
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise UsageError(f"settings file {path} is no TOML: {error}") from None

@@ -189,6 +189,9 @@ class Summary:
         features = self.settings.features
         used = ", ".join(f"{model} {count}" for model, count in self.models.items())
         matches = f"mean {_number(self.matches, 1)}, median {_number(self.matches_median, 0)}"
+        camera = "fixed (assumed)"
+        if self.settings.camera != "fixed":
+            camera = f"{self.settings.camera}, known in {self.frames_with_pose} frames"
         ms = f"median {_number(self.ms_median, 1)} ms, p95 {_number(self.ms_p95, 1)} ms"
         return [
             ("Source", f"{self.source}, {self.size_wh[0]}x{self.size_wh[1]}"),
@@ -199,10 +202,11 @@ class Summary:
             ("Matches", matches),
             ("Inliers", _number(self.inliers, 1)),
             ("Transformation model", used or self.settings.registration.model),
-            ("Camera", f"{self.settings.camera}, known in {self.frames_with_pose} frames"),
+            ("Camera", camera),
             ("Frames", str(self.frames)),
             *((f"Target {target.name}", target.to_text()) for target in self.targets),
-            ("Time a frame", f"{ms}, {_number(self.fps, 1)} frames a second"),
+            ("Tracking time a frame", ms),
+            ("Frames a second", f"{_number(self.fps, 1)}, reading and writing included"),
             ("Peak memory", f"{self.peak_rss_mb:.0f} MB"),
             ("Corrupt packets", str(self.corrupt_packets)),
             ("Skipped pictures", str(len(self.skipped))),
@@ -274,6 +278,11 @@ class SummaryBuilder:
         self._targets: dict[str, _TargetSums] = {}
         self._ms = LogHistogram()
         self._stage_ms: dict[str, float] = {}
+
+    @property
+    def frames(self) -> int:
+        """How many frames were taken in."""
+        return self._frames
 
     def add(self, step: Step) -> None:
         """Take in one frame."""

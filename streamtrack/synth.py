@@ -21,22 +21,32 @@ HEADER = (
 Write = Callable[[Frame], None]
 
 
-def write_synthetic(uri: str, output: str | Path, truth_path: str | Path | None = None) -> int:
+def write_synthetic(
+    uri: str,
+    output: str | Path,
+    truth_path: str | Path | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> int:
     """Render a ``synthetic://`` scene frame by frame; returns how many frames were written.
 
     ``output`` is a video (``.mkv`` is lossless) or, without an ending, a folder for PNG pictures.
     ``truth_path`` is a CSV file with the corners of the target, the share of it that is visible and
-    ``world_from_frame`` row by row. Raises UsageError for the URI and OutputError for the files.
+    ``world_from_frame`` row by row. Ends early, files closed, when ``should_stop`` says so.
+    Raises UsageError for the URI and OutputError for the files.
     """
+    written = 0
     with ExitStack() as stack:
         source = stack.enter_context(SyntheticSource(uri))
-        rate_hz = source.info.rate_hz or 30.0
-        write = stack.enter_context(_pictures(Path(output), rate_hz))
+        assert source.info.rate_hz is not None
+        write = stack.enter_context(_pictures(Path(output), source.info.rate_hz))
         note = stack.enter_context(_truths(None if truth_path is None else Path(truth_path)))
         for frame in source:
             write(frame)
             note(frame, source.truth(frame.index))
-    return len(source)
+            written += 1
+            if should_stop():
+                break
+    return written
 
 
 @contextmanager

@@ -45,6 +45,8 @@ def parse_targets(texts: Sequence[str]) -> list[Target]:
     """
     targets = []
     for number, text in enumerate(texts, start=1):
+        if not text.isprintable():
+            raise UsageError(f"target {text!r}: leave out line breaks and control characters")
         default = "target" if len(texts) == 1 else f"target{number}"
         targets.append(_parse_target(text, default))
     names = [target.name for target in targets]
@@ -85,7 +87,9 @@ def _parse_numbers(text: str) -> list[float] | None:
 
 def _quad_from_numbers(numbers: list[float], text: str) -> Points:
     if not np.all(np.abs(numbers) <= _MAX_COORDINATE):
-        raise UsageError(f"target '{text}': every coordinate must be a finite number of pixels")
+        raise UsageError(
+            f"target '{text}': every coordinate must be a finite number of pixels below a million"
+        )
     if len(numbers) == 4:
         x, y, width, height = numbers
         if width <= 0 or height <= 0:
@@ -122,7 +126,9 @@ def _exists(path: Path) -> bool:
         return False
 
 
-def check_quad_in_picture(name: str, quad: Points, size_wh: Size) -> None:
+def check_quad_in_picture(
+    name: str, quad: Points, size_wh: Size, where: str = "the first frame"
+) -> None:
     """Raise TargetError unless the quad is convex, large enough and mostly inside a picture."""
     if not np.all(np.isfinite(quad)):
         raise TargetError(f"target '{name}' has coordinates that are not finite numbers")
@@ -137,8 +143,8 @@ def check_quad_in_picture(name: str, quad: Points, size_wh: Size) -> None:
     share = geometry.visible_share(quad, size_wh)
     if share < 0.5:
         x0, y0, x1, y1 = geometry.bounding_box(quad)
-        where = "outside" if share == 0 else "mostly outside"
+        outside = "outside" if share == 0 else "mostly outside"
         raise TargetError(
-            f"target '{name}' ({x0:.0f},{y0:.0f} to {x1:.0f},{y1:.0f}) lies {where} the "
-            f"{size_wh[0]}x{size_wh[1]} picture: give it in pixels of the first frame"
+            f"target '{name}' ({x0:.0f},{y0:.0f} to {x1:.0f},{y1:.0f}) lies {outside} the "
+            f"{size_wh[0]}x{size_wh[1]} picture: give it in pixels of {where}"
         )

@@ -165,9 +165,10 @@ class HybridTracker:
             found, evidence = _register_features(
                 self.template, view, features, matches, self._settings
             )
-            return found, evidence, "guided"
+            if found.verdict is Verdict.OK:
+                return found, evidence, "guided"
         sees_all = not self._was_seen or self._frames_lost % _FULL_SEARCH_EVERY == 1
-        features = view.features() if sees_all else view.some_features()
+        features = view.features() if sees_all else view.half_of_features(self._frames_lost)
         matches = match(self.template.features, features, self._settings.matching)
         found, evidence = _register_features(self.template, view, features, matches, self._settings)
         return found, evidence, "global"
@@ -212,7 +213,10 @@ def _register_features(
     found = register(
         template_points, frame_points, settings.registration, template.quad, float(width * height)
     )
-    return found, Evidence(template_points, frame_points, found.is_inlier)
+    is_matched = np.zeros(len(features), np.bool_)
+    is_matched[matches.cur] = True
+    unmatched = features.points[~is_matched]
+    return found, Evidence(template_points, frame_points, found.is_inlier, unmatched)
 
 
 def make_track(

@@ -256,3 +256,65 @@ def test_broken_pipe_ends_quietly(clip: Path, target: str, tmp_path: Path) -> No
     os.close(writer)
     assert "Traceback" not in result.stderr
     assert len(rows_of(tmp_path / "t.csv")) == 3
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["--video", "{clip}"],
+        ["--output", "same.csv", "--poses", "same.csv"],
+        ["--record", "same.mkv"],
+    ],
+)
+def test_no_output_replaces_the_source_or_another(
+    run: Run, clip: Path, target: str, capsys: pytest.CaptureFixture[str], flags: list[str]
+) -> None:
+    before = clip.read_bytes()
+    filled = [text.format(clip=clip) for text in flags]
+    no_record = [] if "--record" in flags else ["--no-record"]
+    assert run("track", clip, "--target", target, *no_record, *filled) == 2
+    assert clip.read_bytes() == before
+    assert capsys.readouterr().err.startswith("streamtrack: error: ")
+
+
+def test_two_runs_in_one_second_do_not_share_a_recording(
+    run: Run, clip: Path, target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli.time, "strftime", lambda _: "20260101-000000")
+    for _ in range(2):
+        assert run("track", clip, "--target", target, "--frames", 1, "--quiet") == 0
+    names = sorted(p.name for p in (tmp_path / "recordings").iterdir())
+    assert names == ["board-20260101-000000-2.rrd", "board-20260101-000000.rrd"]
+
+
+def test_a_model_that_was_asked_for_is_the_one_reported(
+    run: Run, clip: Path, target: str, tmp_path: Path
+) -> None:
+    flags = ("--model", "similarity", "--no-record", "-q", "--output", "t.csv", "--frames", 5)
+    assert run("track", clip, "--target", target, *flags) == 0
+    assert {row["model"] for row in rows_of(tmp_path / "t.csv")} <= {"similarity", ""}
+
+
+def test_settings_that_are_no_sections_are_refused(
+    run: Run, clip: Path, target: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "s.toml").write_text("features = 3\n")
+    flags = ("--no-record", "--settings", "s.toml", "--detector", "fast")
+    assert run("track", clip, "--target", target, *flags) == 2
+    assert "features" in capsys.readouterr().err
+
+
+def test_interrupted_synth_leaves_a_whole_file(tmp_path: Path) -> None:
+    scene = SCENE.replace("frames=24", "frames=100000")
+    command = [sys.executable, "-m", "streamtrack.cli", "synth", scene, "-o", "s.mp4"]
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    while not (tmp_path / "s.mp4").exists():
+        assert process.poll() is None
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "interrupted after" in errors
+    from streamtrack.sources import open_source
+
+    with open_source(tmp_path / "s.mp4") as source:
+        assert sum(1 for _ in source) > 0

@@ -151,7 +151,7 @@ def test_rows_speak_the_words_of_the_ancestor() -> None:
     assert rows["Transformation model"] == "homography 1"
     assert rows["Target board"].startswith("tracked 1 of 1 (100.0%), lost 0, searching 0")
     assert "RMSE 0.50 px" in rows["Target board"]
-    assert rows["Time a frame"].startswith("median 4.0 ms, p95 4.0 ms")
+    assert rows["Tracking time a frame"].startswith("median 4.0 ms, p95 4.0 ms")
     assert rows["Corrupt packets"] == "2"
     assert rows["Skipped pictures"] == "1"
 

@@ -136,7 +136,7 @@ def test_pictures(folder: Path, text: str, name: str, quad: Points | None) -> No
         ("half.png", TargetError, "half.png cannot be read"),
         ("folder", TargetError, "folder cannot be read"),
         ("x" * 5000, UsageError, "neither numbers nor a file"),
-        ("bad\0name.png", UsageError, "neither numbers nor a file"),
+        ("bad\0name.png", UsageError, "control characters"),
     ],
 )
 def test_what_is_no_target_is_refused(

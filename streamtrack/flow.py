@@ -16,16 +16,10 @@ import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.blur import fitted_length, motion_blur
+from streamtrack.fitting import poorest_model, transfer_errors
 from streamtrack.frame_view import FrameView
 from streamtrack.refine import Prior, refined
-from streamtrack.registration import (
-    Effort,
-    judge_mapping,
-    poorest_model,
-    refused,
-    register,
-    transfer_errors,
-)
+from streamtrack.registration import Effort, judge_mapping, refused, register
 from streamtrack.settings import RegistrationSettings
 from streamtrack.template import Patch, Template
 from streamtrack.types import Image, Mask, Matrix, Model, Points, Registration, Verdict

@@ -20,10 +20,11 @@ from streamtrack.appearance import (
     MAX_CHROMA_DISTANCE_OTHER_CAMERA,
     chroma_distance,
 )
+from streamtrack.fitting import fit
 from streamtrack.flow import Alignment, FlowAligner
 from streamtrack.frame_view import FrameView
 from streamtrack.matching import match, match_guided
-from streamtrack.registration import fit, refused, register
+from streamtrack.registration import refused, register
 from streamtrack.settings import Settings
 from streamtrack.template import Template
 from streamtrack.types import (

@@ -9,16 +9,8 @@ import pytest
 from conftest import MakeHomography
 
 from streamtrack import geometry
-from streamtrack.registration import (
-    DEGREES_OF_FREEDOM,
-    dlt_homography,
-    fit,
-    judge_mapping,
-    log10_false_alarms,
-    refused,
-    register,
-    transfer_errors,
-)
+from streamtrack.fitting import DEGREES_OF_FREEDOM, dlt_homography, fit, transfer_errors
+from streamtrack.registration import judge_mapping, log10_false_alarms, refused, register
 from streamtrack.settings import RegistrationSettings, build_settings
 from streamtrack.types import Matrix, Model, Points, Registration, Verdict
 

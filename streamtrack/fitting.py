@@ -1,0 +1,235 @@
+"""Least squares for each transformation model, and the choice between the models."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import log
+
+import numpy as np
+import numpy.typing as npt
+
+from streamtrack import geometry
+from streamtrack.types import Mask, Matrix, Model, Points
+
+Doubles = npt.NDArray[np.float64]
+
+DEGREES_OF_FREEDOM = {
+    Model.TRANSLATION: 2,
+    Model.SIMILARITY: 4,
+    Model.AFFINE: 6,
+    Model.HOMOGRAPHY: 8,
+}
+_MIN_NOISE_PX = 0.05
+"""Smaller differences between models are not worth a further freedom."""
+
+
+def fit_to_inliers(
+    model: Model, a: Points, b: Points, is_inlier: Mask, threshold_px: float, rounds: int
+) -> tuple[Matrix, Mask]:
+    """Least squares over the inliers, then ``rounds`` more with Tukey's biweight as weights.
+
+    Returns b_from_a and the pairs (M,) within ``threshold_px`` of it. The weights fall to zero
+    at 4.685 times the residuals' own scale (Huber & Ronchetti 2009), never beyond the threshold,
+    so that good pairs sharpen the result and doubtful ones do not blur it.
+    """
+    b_from_a = fit(model, a[is_inlier], b[is_inlier])
+    for _ in range(rounds):
+        weights = _biweights(transfer_errors(b_from_a, a, b), threshold_px)
+        if np.count_nonzero(weights) < DEGREES_OF_FREEDOM[model]:
+            break
+        if model is Model.HOMOGRAPHY:
+            used = weights > 0
+            b_from_a = gauss_newton_step(
+                b_from_a, a[used].astype(np.float64), b[used].astype(np.float64), weights[used]
+            )
+        else:
+            b_from_a = fit(model, a, b, weights)
+    return b_from_a, transfer_errors(b_from_a, a, b) < threshold_px
+
+
+def _biweights(errors: Doubles, threshold_px: float) -> Doubles:
+    """Tukey's biweight of each error (M,), its scale taken from the errors below the threshold."""
+    near = errors[errors < threshold_px]
+    if len(near) == 0:
+        return np.zeros(len(errors))
+    # The median length of a 2-D Gaussian error is 1.1774 times its standard deviation.
+    scale = _median(near) / 1.1774
+    cut = min(max(4.685 * scale, 0.25), threshold_px)
+    weights: Doubles = np.where(errors < cut, (1 - (errors / cut) ** 2) ** 2, 0.0)
+    return weights
+
+
+def _median(values: Doubles) -> float:
+    """The upper median: as good here as the mean of the two, and three times as fast."""
+    middle = len(values) // 2
+    return float(np.partition(values, middle)[middle])
+
+
+def fit(model: Model, a: Points, b: Points, weights: Doubles | None = None) -> Matrix:
+    """Weighted least-squares mapping of a model from pairs (M, 2); ``weights`` (M,)."""
+    w = np.ones(len(a)) if weights is None else np.asarray(weights, np.float64)
+    used = w > 0
+    pa, pb, w = a[used].astype(np.float64), b[used].astype(np.float64), w[used]
+    if model is Model.TRANSLATION:
+        return geometry.translation(*_mean(pb - pa, w))
+    if model is Model.SIMILARITY:
+        return _fit_similarity(pa, pb, w)
+    if model is Model.AFFINE:
+        return _fit_affine(pa, pb, w)
+    return gauss_newton_step(dlt_homography(pa, pb, w), pa, pb, w)
+
+
+def _fit_similarity(a: Doubles, b: Doubles, w: Doubles) -> Matrix:
+    """Scale, rotation and shift as one complex number each: b = s a + t."""
+    mean_a, mean_b = _mean(a, w), _mean(b, w)
+    za = (a - mean_a) @ np.array([1, 1j])
+    zb = (b - mean_b) @ np.array([1, 1j])
+    spread = float(np.sum(w * np.abs(za) ** 2))
+    s = complex(np.sum(w * np.conj(za) * zb)) / spread if spread > 0 else 1.0 + 0j
+    linear = np.array([[s.real, -s.imag], [s.imag, s.real]])
+    return _affine_matrix(linear, mean_b - linear @ mean_a)
+
+
+def _fit_affine(a: Doubles, b: Doubles, w: Doubles) -> Matrix:
+    mean_a, mean_b = _mean(a, w), _mean(b, w)
+    centred = a - mean_a
+    weighted = (centred * w[:, None]).T
+    # The pseudo-inverse leaves alone what collinear points do not determine.
+    linear = (np.linalg.pinv(weighted @ centred) @ (weighted @ (b - mean_b))).T
+    return _affine_matrix(linear, mean_b - linear @ mean_a)
+
+
+def _mean(points: Doubles, weights: Doubles) -> Doubles:
+    """Weighted mean of points (N, 2)."""
+    mean: Doubles = weights @ points / weights.sum()
+    return mean
+
+
+def _affine_matrix(linear: Doubles, shift: Doubles) -> Matrix:
+    matrix = np.eye(3)
+    matrix[:2, :2] = linear
+    matrix[:2, 2] = shift
+    return matrix
+
+
+def dlt_homography(a: Doubles, b: Doubles, weights: Doubles | None = None) -> Matrix:
+    """Homography by the normalised Direct Linear Transformation, b ~ H a.
+
+    Hartley & Zisserman, Multiple View Geometry, 2nd ed., algorithm 4.2. Each pair
+    (x, y) -> (u, v) gives two rows of A h = 0 (equation 4.3 with w = 1):
+
+        [ 0  0  0  -x -y -1   vx  vy  v ]
+        [ x  y  1   0  0  0  -ux -uy -u ]
+
+    h, the rows of H one after the other, is the right singular vector of the smallest singular
+    value. Both point sets are first moved to their centroid and scaled to a mean distance of
+    sqrt(2), without which the equations are badly conditioned (Hartley 1997):
+    H = T_b^-1 H' T_a. A pair's two rows are multiplied by the root of its weight.
+
+    Needs at least 4 pairs, no three of which are collinear; ``a``, ``b`` (M, 2).
+    """
+    a_to_unit, b_to_unit = _normaliser(a), _normaliser(b)
+    x, y = (a @ a_to_unit[:2, :2].T + a_to_unit[:2, 2]).T
+    u, v = (b @ b_to_unit[:2, :2].T + b_to_unit[:2, 2]).T
+    root = np.ones(len(a)) if weights is None else np.sqrt(weights)
+    zero, one = np.zeros(len(a)), np.ones(len(a))
+    upper = np.stack([zero, zero, zero, -x, -y, -one, v * x, v * y, v], axis=1)
+    lower = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1)
+    rows = np.concatenate([upper * root[:, None], lower * root[:, None]])
+    # The right singular vectors of A are the eigenvectors of A^T A, which is only 9 x 9; the
+    # normalisation keeps the squared condition number harmless in double precision.
+    smallest = np.linalg.eigh(rows.T @ rows)[1][:, 0].reshape(3, 3)
+    matrix = np.linalg.solve(b_to_unit, smallest @ a_to_unit)
+    corner = matrix[2, 2]
+    return np.asarray(matrix / corner if abs(corner) > 1e-12 else matrix, np.float64)
+
+
+def _normaliser(points: Doubles) -> Matrix:
+    centre = points.mean(axis=0)
+    distance = float(np.mean(np.linalg.norm(points - centre, axis=1)))
+    factor = np.sqrt(2) / distance if distance > 0 else 1.0
+    return np.array(
+        [[factor, 0.0, -factor * centre[0]], [0.0, factor, -factor * centre[1]], [0.0, 0.0, 1.0]]
+    )
+
+
+def gauss_newton_step(start: Matrix, a: Doubles, b: Doubles, weights: Doubles) -> Matrix:
+    """``start`` moved by one step on the weighted transfer error in b.
+
+    The DLT minimises an algebraic error, this the geometric one (Hartley & Zisserman, section
+    4.2.3; Jacobian of equation 4.21). Columns are scaled to unit length for conditioning.
+    """
+    homogeneous, residual = _residuals(start, a, b)
+    jacobian = _homography_jacobian(a, homogeneous) * start[2, 2]
+    length = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian)) + 1e-300
+    jacobian /= length
+    weighted = jacobian * np.repeat(weights, 2)[:, None]
+    normal = weighted.T @ jacobian
+    normal[np.diag_indices(8)] *= 1 + 1e-9
+    try:
+        change = np.linalg.solve(normal, weighted.T @ residual.reshape(-1)) / length
+    except np.linalg.LinAlgError:
+        return start
+    moved = start / start[2, 2] + np.append(change, 0.0).reshape(3, 3)
+    return moved if np.all(np.isfinite(moved)) else start
+
+
+def _residuals(b_from_a: Matrix, a: Doubles, b: Doubles) -> tuple[Doubles, Doubles]:
+    homogeneous = a @ b_from_a[:, :2].T + b_from_a[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mapped = homogeneous[:, :2] / homogeneous[:, 2:]
+    return homogeneous, b - mapped
+
+
+def _homography_jacobian(a: Doubles, homogeneous: Doubles) -> Doubles:
+    """d(u, v) / d(h11 .. h32), shape (2 M, 8), rows u0, v0, u1, v1 ..."""
+    x, y = a.T
+    inverse_depth = 1 / homogeneous[:, 2]
+    u, v = (homogeneous[:, :2] * inverse_depth[:, None]).T
+    jacobian = np.zeros((len(a), 2, 8))
+    ray = np.stack([x, y, np.ones(len(a))], axis=1) * inverse_depth[:, None]
+    jacobian[:, 0, 0:3] = ray
+    jacobian[:, 1, 3:6] = ray
+    jacobian[:, 0, 6:8] = -u[:, None] * ray[:, :2]
+    jacobian[:, 1, 6:8] = -v[:, None] * ray[:, :2]
+    return jacobian.reshape(-1, 8)
+
+
+def transfer_errors(b_from_a: Matrix, a: Points, b: Points) -> Doubles:
+    """Distance (M,) in b between each mapped point of a and its partner; inf at the horizon."""
+    _, residual = _residuals(b_from_a, a.astype(np.float64), b.astype(np.float64))
+    distances = np.hypot(residual[:, 0], residual[:, 1])
+    distances[np.isnan(distances)] = np.inf
+    return distances
+
+
+def choose_model(a: Points, b: Points, ladder: Sequence[Model] = tuple(Model)) -> Model:
+    """The model of a ladder, poorest first, with the least GRIC.
+
+    Geometric Robust Information Criterion (Torr 1998, "Geometric motion segmentation and model
+    selection"): sum of min(e^2 / s^2, 2 (r - d)) + l1 d n + l2 k with r = 4 coordinates a pair,
+    d = 2 dimensions of the manifold, k degrees of freedom, l1 = ln r (the same for all four
+    models, so left out) and l2 = ln(r n). The noise s is that of the richest model's residuals,
+    at least `_MIN_NOISE_PX`. It asks of each further freedom that it pays in residuals.
+    """
+    if len(ladder) == 1:
+        return ladder[0]
+    residuals = {model: transfer_errors(fit(model, a, b), a, b) for model in ladder}
+    richest = residuals[ladder[-1]]
+    noise_px = max(_MIN_NOISE_PX, _median(richest) / 1.1774)
+    penalty = log(4 * len(a))
+
+    def gric(model: Model) -> float:
+        cost = np.minimum((residuals[model] / noise_px) ** 2, 4.0)
+        return float(cost.sum()) + penalty * DEGREES_OF_FREEDOM[model]
+
+    return min(ladder, key=gric)
+
+
+def poorest_model(b_from_a: Matrix, region: Points) -> Model:
+    """The model of fewest freedoms that maps the quad ``region`` (4, 2) like ``b_from_a``."""
+    quad = geometry.transform_points(b_from_a, region)
+    for model in Model:
+        if transfer_errors(fit(model, region, quad), region, quad).max() < _MIN_NOISE_PX:
+            return model
+    return Model.HOMOGRAPHY

@@ -27,7 +27,7 @@ from streamtrack.sources.writer import VideoWriter
 from streamtrack.types import Image, Points, Size
 
 _RATE_HZ = 30.0
-_WARM_UP_FRAMES = 4
+_WARM_UP_FRAMES = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)

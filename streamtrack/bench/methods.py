@@ -102,8 +102,8 @@ _ALL = (
     Method("lk-chain", "LK chain", peers.LucasKanadeChain, peers.CHAIN_PARAMETERS),
     Method("prewarp-lk", "Pre-warp LK", prewarp.PreWarpLK, prewarp.PARAMETERS),
     Method("prewarp-dis", "Pre-warp DIS", prewarp.PreWarpDIS, prewarp.PARAMETERS),
-    Method("csrt", "CSRT (box)", peers.csrt, {"parameters": "OpenCV's defaults"}, is_box=True),
-    Method("kcf", "KCF (box)", peers.kcf, {"parameters": "OpenCV's defaults"}, is_box=True),
+    Method("csrt", "CSRT, box", peers.csrt, {"parameters": "OpenCV's defaults"}, is_box=True),
+    Method("kcf", "KCF, box", peers.kcf, {"parameters": "OpenCV's defaults"}, is_box=True),
 )
 METHODS: Mapping[str, Method] = {method.name: method for method in _ALL}
 QUICK_METHODS = (

@@ -31,7 +31,7 @@ def motion_blur(template: Image, seen: Image, area: Mask) -> Doubles:
         values, vectors = np.linalg.eig(np.linalg.solve(sharp, smeared))
     except np.linalg.LinAlgError:
         return np.zeros(2)
-    lost_most = int(np.real(values).argmin())
+    lost_most = int(np.argmin(np.real(values)))
     if np.real(values[lost_most]) > _SHARP_RATIO * np.real(values[1 - lost_most]):
         return np.zeros(2)
     along: Doubles = np.real(vectors[:, lost_most]).astype(np.float64)

@@ -23,16 +23,16 @@ _MIN_NOISE_PX = 0.05
 """Smaller differences between models are not worth a further freedom."""
 
 
-def fit_to_inliers(
-    model: Model, a: Points, b: Points, is_inlier: Mask, threshold_px: float, rounds: int
+def fit_robustly(
+    model: Model, start: Matrix, a: Points, b: Points, threshold_px: float, rounds: int
 ) -> tuple[Matrix, Mask]:
-    """Least squares over the inliers, then ``rounds`` more with Tukey's biweight as weights.
+    """``start`` improved by rounds of least squares with Tukey's biweight as weights.
 
     Returns b_from_a and the pairs (M,) within ``threshold_px`` of it. The weights fall to zero
     at 4.685 times the residuals' own scale (Huber & Ronchetti 2009), never beyond the threshold,
     so that good pairs sharpen the result and doubtful ones do not blur it.
     """
-    b_from_a = fit(model, a[is_inlier], b[is_inlier])
+    b_from_a = start
     for _ in range(rounds):
         weights = _biweights(transfer_errors(b_from_a, a, b), threshold_px)
         if np.count_nonzero(weights) < DEGREES_OF_FREEDOM[model]:
@@ -203,8 +203,8 @@ def transfer_errors(b_from_a: Matrix, a: Points, b: Points) -> Doubles:
     return distances
 
 
-def choose_model(a: Points, b: Points, ladder: Sequence[Model] = tuple(Model)) -> Model:
-    """The model of a ladder, poorest first, with the least GRIC.
+def fit_best_model(a: Points, b: Points, ladder: Sequence[Model]) -> tuple[Model, Matrix]:
+    """The model of a ladder, poorest first, with the least GRIC, and its fit to the pairs.
 
     Geometric Robust Information Criterion (Torr 1998, "Geometric motion segmentation and model
     selection"): sum of min(e^2 / s^2, 2 (r - d)) + l1 d n + l2 k with r = 4 coordinates a pair,
@@ -212,24 +212,32 @@ def choose_model(a: Points, b: Points, ladder: Sequence[Model] = tuple(Model)) -
     models, so left out) and l2 = ln(r n). The noise s is that of the richest model's residuals,
     at least `_MIN_NOISE_PX`. It asks of each further freedom that it pays in residuals.
     """
+    fits = {model: fit(model, a, b) for model in ladder}
     if len(ladder) == 1:
-        return ladder[0]
-    residuals = {model: transfer_errors(fit(model, a, b), a, b) for model in ladder}
-    richest = residuals[ladder[-1]]
-    noise_px = max(_MIN_NOISE_PX, _median(richest) / 1.1774)
+        return ladder[0], fits[ladder[0]]
+    residuals = {model: transfer_errors(fits[model], a, b) for model in ladder}
+    noise_px = max(_MIN_NOISE_PX, _median(residuals[ladder[-1]]) / 1.1774)
     penalty = log(4 * len(a))
 
     def gric(model: Model) -> float:
         cost = np.minimum((residuals[model] / noise_px) ** 2, 4.0)
         return float(cost.sum()) + penalty * DEGREES_OF_FREEDOM[model]
 
-    return min(ladder, key=gric)
+    best = min(ladder, key=gric)
+    return best, fits[best]
 
 
 def poorest_model(b_from_a: Matrix, region: Points) -> Model:
     """The model of fewest freedoms that maps the quad ``region`` (4, 2) like ``b_from_a``."""
     quad = geometry.transform_points(b_from_a, region)
-    for model in Model:
-        if transfer_errors(fit(model, region, quad), region, quad).max() < _MIN_NOISE_PX:
-            return model
-    return Model.HOMOGRAPHY
+    affine = fit(Model.AFFINE, region, quad)
+    if np.max(transfer_errors(affine, region, quad)) > _MIN_NOISE_PX:
+        return Model.HOMOGRAPHY
+    linear = affine[:2, :2]
+    reach_px = float(np.max(np.linalg.norm(region - region.mean(axis=0), axis=1)))
+    cosine, sine = linear[0, 0] + linear[1, 1], linear[1, 0] - linear[0, 1]
+    similar = np.array([[cosine, -sine], [sine, cosine]]) / 2
+    if np.linalg.norm(linear - similar) * reach_px > _MIN_NOISE_PX:
+        return Model.AFFINE
+    is_shift = np.linalg.norm(linear - np.eye(2)) * reach_px <= _MIN_NOISE_PX
+    return Model.TRANSLATION if is_shift else Model.SIMILARITY

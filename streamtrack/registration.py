@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.fitting import choose_model, fit_to_inliers, transfer_errors
+from streamtrack.fitting import fit_best_model, fit_robustly, transfer_errors
 from streamtrack.settings import RegistrationSettings
 from streamtrack.types import Mask, Matrix, Model, Points, Registration, Verdict
 
@@ -66,9 +66,9 @@ def register(
     if np.count_nonzero(is_inlier) < settings.min_inliers:
         return refused(Verdict.TOO_FEW_INLIERS, len(a), is_inlier)
     ladder = effort.ladder if settings.model == "auto" else (Model(settings.model),)
-    model = choose_model(a[is_inlier], b[is_inlier], ladder)
-    b_from_a, is_inlier = fit_to_inliers(
-        model, a, b, is_inlier, settings.inlier_threshold_px, effort.robust_rounds
+    model, start = fit_best_model(a[is_inlier], b[is_inlier], ladder)
+    b_from_a, is_inlier = fit_robustly(
+        model, start, a, b, settings.inlier_threshold_px, effort.robust_rounds
     )
     inliers = int(np.count_nonzero(is_inlier))
     verdict = _judge_support(a, is_inlier, settings, region, candidate_area_px)

@@ -125,17 +125,24 @@ def _make_patch(
         points = _textured_points(image, inside)
     template_points = geometry.transform_points(geometry.inverted(patch_from_template), points)
     gradients = make_gradients(image, inside)
-    nearest = _nearest_rows(points, gradients.index, size[0])
+    nearest = _nearest_rows(points, gradients.index, size)
     return Patch(image, patch_from_template, scale, points, template_points, gradients, nearest)
 
 
-def _nearest_rows(points: Points, index: npt.NDArray[np.intp], width: int) -> npt.NDArray[np.intp]:
+def _nearest_rows(points: Points, index: npt.NDArray[np.intp], size: Size) -> npt.NDArray[np.intp]:
     """Row of the point nearest to each pixel, given as a place in the flattened patch."""
     if len(points) == 0:
         return np.zeros(0, np.intp)
-    dx = (index % width)[:, None] - points[None, :, 0]
-    dy = (index // width)[:, None] - points[None, :, 1]
-    return np.asarray((dx * dx + dy * dy).argmin(axis=1), np.intp)
+    columns, lines = points.astype(np.intp).T
+    is_elsewhere = np.ones((size[1], size[0]), np.uint8)
+    is_elsewhere[lines, columns] = 0
+    _, labels = cv2.distanceTransformWithLabels(
+        is_elsewhere, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    row_of_label = np.zeros(int(np.max(labels)) + 1, np.intp)
+    row_of_label[labels[lines, columns]] = np.arange(len(points))
+    nearest: npt.NDArray[np.intp] = row_of_label[labels.ravel()[index]]
+    return nearest
 
 
 def _polygon_mask(polygon: Points, size: tuple[int, int]) -> Mask:

@@ -49,7 +49,7 @@ def motion_blur(template: Image, seen: Image, area: Mask) -> Doubles:
     return along * shorter_px
 
 
-def fitted_length(template: Image, seen: Image, area: Mask, vector: Doubles) -> Doubles:
+def with_best_length(template: Image, seen: Image, area: Mask, vector: Doubles) -> Doubles:
     """``vector`` made longer or shorter, as ``seen``, now well aligned, correlates best."""
     values = seen[area].astype(np.float64)
 

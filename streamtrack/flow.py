@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.blur import fitted_length, motion_blur
+from streamtrack.blur import motion_blur, with_best_length
 from streamtrack.fitting import poorest_model, transfer_errors
 from streamtrack.frame_view import FrameView
 from streamtrack.refine import Prior, refined
@@ -26,14 +26,14 @@ from streamtrack.types import Image, Mask, Matrix, Model, Points, Registration, 
 
 Floats = npt.NDArray[np.float32]
 
-_MIN_CORRELATION = 0.5
-_MIN_SUPPORTED_SHARE = 0.12
+_MIN_CORRELATION = 0.5  # of a point's window, below which the point is no evidence
+_MIN_SUPPORTED_SHARE = 0.12  # of the points in view that must agree with the pose
 _MIN_VISIBLE_POINTS = 10
-_CORRELATION_WINDOW = 11
-_NOISE_VARIANCE = 9.0
-_SEARCH_PX = 12.0
-_INLIER_PX = 1.5
-_COARSE_STEPS = 2
+_CORRELATION_WINDOW = 11  # patch pixels
+_NOISE_VARIANCE = 9.0  # grey levels squared
+_SEARCH_PX = 12.0  # how far, in patch pixels, a flow may reach: the area for chance agreement
+_INLIER_PX = 1.5  # patch pixels
+_COARSE_STEPS = 2  # patches between the fine and the coarse alignment: half the resolution
 _ROUGH = Effort((Model.AFFINE,), 0)
 _QUICK = Effort((Model.AFFINE, Model.HOMOGRAPHY), 1)
 
@@ -111,7 +111,7 @@ class FlowAligner:
             return sharp, np.zeros(2)
         seen = _warp_back(view, patch, pose)
         area = _near(patch, seen.visible)
-        return smeared, fitted_length(patch.image, seen.image, area, smear)
+        return smeared, with_best_length(patch.image, seen.image, area, smear)
 
     def _refined(
         self, view: FrameView, patch: Patch, found: Alignment, prior: Prior | None

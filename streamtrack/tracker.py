@@ -41,13 +41,13 @@ from streamtrack.types import (
 )
 
 _GUIDED_RADIUS_PX = 60.0
-_COAST_FRAMES = 10
-_FULL_SEARCH_EVERY = 12
+_COAST_FRAMES = 10  # lost frames in which the last pose is still tried
+_FULL_SEARCH_EVERY = 12  # lost frames; between them half of the features are searched
 _FIRST_SURPRISE_PX = 5.0
 _MIN_SURPRISE_PX = 1.0
-_SURPRISE_RATE = 0.2
-_CLEAR_VIEW_SHARE = 0.5
-_COLOR_REACH_SHARE = 0.04
+_SURPRISE_RATE = 0.2  # share of a new frame's surprise in the running mean
+_CLEAR_VIEW_SHARE = 0.5  # inliers of all points, below which a frame teaches no surprise
+_COLOR_REACH_SHARE = 0.04  # of the target's size: how far around a point colours are compared
 
 
 class TargetTracker(Protocol):

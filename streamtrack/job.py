@@ -102,7 +102,9 @@ def run_track(job: TrackJob, progress: Progress, should_stop: Callable[[], bool]
         except StreamtrackError as raised:
             error, ended = raised, str(raised)
         summary = builder.build(
-            source.skipped, source.corrupt_packets, ended or _natural_end(job, builder.frames)
+            source.skipped,
+            source.corrupt_packets,
+            ended or _natural_end(job, source, builder.frames),
         )
         failure = finish(summary)
         error = error or failure
@@ -127,8 +129,10 @@ def _check_outputs(job: TrackJob) -> None:
         taken[path.resolve()] = f"the {name} output"
 
 
-def _natural_end(job: TrackJob, frames: int) -> str:
-    return f"{frames} frames, as asked" if frames == job.frames else "end of source"
+def _natural_end(job: TrackJob, source: FrameSource, frames: int) -> str:
+    if frames == job.frames:
+        return f"{frames} frames, as asked"
+    return f"the source {source.shortfall}" if source.shortfall else "end of source"
 
 
 def _is_device(path: Path) -> bool:

@@ -29,6 +29,7 @@ class FrameList:
         self.info = SourceInfo("frames", size_wh, 30.0, len(frames))
         self.skipped: Sequence[Skipped] = ()
         self.corrupt_packets = 0
+        self.shortfall = ""
 
     def __iter__(self) -> Iterator[Frame]:
         return self._frames

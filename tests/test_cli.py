@@ -120,6 +120,25 @@ def test_flags_win_over_the_settings_file(
     assert (summary["detector"], summary["descriptor"]) == ("fast", "freak")
 
 
+def test_the_summary_says_how_the_run_ended(
+    run: Run, clip: Path, target: str, tmp_path: Path
+) -> None:
+    whole = tmp_path / "whole.mkv"
+    with SyntheticSource(SCENE) as source, VideoWriter(whole, rate_hz=30) as writer:
+        for frame in source:
+            writer.write(frame.image, frame.time_s)
+    data = whole.read_bytes()
+    (tmp_path / "cut.mkv").write_bytes(data[: len(data) // 2])
+    for name, flags, ended in (
+        ("whole.mkv", (), "end of source"),
+        ("whole.mkv", ("--frames", 3), "3 frames, as asked"),
+        ("cut.mkv", (), "the source ends early"),
+    ):
+        arguments = ("--no-record", "-q", "--summary", "s.json", *flags)
+        assert run("track", tmp_path / name, "--target", target, *arguments) == 0
+        assert json.loads((tmp_path / "s.json").read_text())["ended"].startswith(ended)
+
+
 @pytest.mark.parametrize("camera", ["fixed", "moving"])
 def test_poses(run: Run, clip: Path, target: str, tmp_path: Path, camera: str) -> None:
     flags = ("--no-record", "-q", "--camera", camera, "--poses", "p.csv", "--frames", 4)

@@ -34,6 +34,7 @@ class _Feed:
 
     skipped: Sequence[Skipped] = ()
     corrupt_packets = 0
+    shortfall = ""
 
     def __init__(self, image: Image) -> None:
         self.image = image

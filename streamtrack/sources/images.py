@@ -71,6 +71,11 @@ class ImageSource:
         """Always 0: pictures that cannot be read are named in `skipped`."""
         return 0
 
+    @property
+    def shortfall(self) -> str:
+        """Always empty: what is missing is named in `skipped`."""
+        return ""
+
     def __enter__(self) -> Self:
         return self
 

@@ -84,6 +84,10 @@ class SyntheticSource:
         return 0
 
     @property
+    def shortfall(self) -> str:
+        return ""
+
+    @property
     def initial_quad(self) -> Points:
         """The target's corners in frame 0."""
         return self.truth(0).quad

@@ -48,6 +48,7 @@ class VideoSource:
         """Open ``path`` and decode its first picture. Raises SourceError."""
         self._path = Path(path)
         self._corrupt = 0
+        self._shortfall = ""
         self._packets_met = 0
         self._is_started = False
         # Packets met before it is known whether they can be copied.
@@ -79,6 +80,11 @@ class VideoSource:
     def corrupt_packets(self) -> int:
         """Packets so far that were damaged or whose picture was."""
         return self._corrupt
+
+    @property
+    def shortfall(self) -> str:
+        """After the last frame: how much shorter the file is than its header says, or empty."""
+        return self._shortfall
 
     def __enter__(self) -> Self:
         return self
@@ -269,10 +275,11 @@ class VideoSource:
         )
         if is_short:
             promised = f"{expected} frames" if expected else f"{length_s:.2f} s"
-            _log.warning(
-                "%s ends early, truncated or damaged: %d frames up to %.2f s of %s could be read",
-                *(name, frames, end_s, promised),
+            self._shortfall = (
+                f"ends early, truncated or damaged: {frames} frames up to {end_s:.2f} s "
+                f"of {promised} could be read"
             )
+            _log.warning("%s %s", name, self._shortfall)
 
 
 def _size_wh(image: Image) -> Size:

@@ -21,7 +21,7 @@ from streamtrack.settings import RegistrationSettings
 from streamtrack.types import Mask, Matrix, Model, Points, Registration, Verdict
 
 _MAX_AREA_RATIO = 60.0
-_MAX_PERSPECTIVE_RATIO = 40.0
+_MAX_PERSPECTIVE_RATIO = 15.0
 _MIN_SPREAD_SHARE = 0.02
 _MAX_LOG10_FALSE_ALARMS = -4.0
 
@@ -176,7 +176,7 @@ def judge_mapping(b_from_a: Matrix, region: Points) -> Verdict:
 
     Refuses fold-over and mirroring (depth or area changes sign), quads that are not convex,
     areas that change more than 60-fold, and perspective under which one corner is magnified
-    40 times as much as another.
+    15 times as much as another.
     """
     if not np.all(np.isfinite(b_from_a)):
         return Verdict.MIRRORED

@@ -42,6 +42,8 @@ from streamtrack.types import (
 
 _GUIDED_RADIUS_PX = 60.0
 _COAST_FRAMES = 10  # lost frames in which the last pose is still tried
+_MAX_AREA_JUMP = 1.5  # from the prediction to what is found
+_MIN_RETURN_SHARE = 0.3  # of the points in view, for a lost target found at its last place
 _FULL_SEARCH_EVERY = 12  # lost frames; between them half of the features are searched
 _FIRST_SURPRISE_PX = 5.0
 _MIN_SURPRISE_PX = 1.0
@@ -115,13 +117,32 @@ class HybridTracker:
             return None
         guess = self._pose if self._step_pose is None else self._step_pose @ self._pose
         sigma_px = self._surprise_px if self._frames_lost == 0 else None
-        followed = self._aligner.align(view, guess, sigma_px)
+        followed = self._plausible(self._aligner.align(view, guess, sigma_px), guess)
         found = followed.registration
         if found.b_from_a is not None and self._frames_lost == 0:
             share = np.count_nonzero(found.is_inlier) / len(followed.is_in_view)
             if share >= _CLEAR_VIEW_SHARE:
                 self._learn_surprise(guess, found.b_from_a)
         return followed if self._frames_lost == 0 else self._with_own_colors(followed, view)
+
+    def _plausible(self, alignment: Alignment, guess: Matrix) -> Alignment:
+        """The alignment, refused if the target jumped in size, or came back on thin evidence."""
+        found = alignment.registration
+        if found.b_from_a is None:
+            return alignment
+        verdict = Verdict.OK
+        quad = self.template.quad
+        area_ratio = geometry.signed_area(
+            geometry.transform_points(found.b_from_a, quad)
+        ) / geometry.signed_area(geometry.transform_points(guess, quad))
+        if not 1 / _MAX_AREA_JUMP <= area_ratio <= _MAX_AREA_JUMP:
+            verdict = Verdict.AREA
+        elif self._frames_lost and np.mean(found.is_inlier) < _MIN_RETURN_SHARE:
+            verdict = Verdict.LOW_CORRELATION
+        if verdict is Verdict.OK:
+            return alignment
+        refusal = refused(verdict, len(found.is_inlier), found.is_inlier)
+        return replace(alignment, registration=refusal)
 
     def _learn_surprise(self, expected: Matrix, found: Matrix) -> None:
         """How far the corners are from their prediction, averaged over the last frames."""

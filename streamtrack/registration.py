@@ -96,13 +96,9 @@ def robust_inliers(a: Points, b: Points, settings: RegistrationSettings) -> Mask
     MAGSAC++ (Barath et al. 2020) as in OpenCV's USAC, with the seed of the settings.
     """
     if settings.model in ("translation", "similarity", "affine"):
-        return _robust_affine_inliers(a, b, settings)
-    _, mask = cv2.findHomography(a, b, _usac(settings))
-    return _as_mask(mask, len(a))
-
-
-def _robust_affine_inliers(a: Points, b: Points, settings: RegistrationSettings) -> Mask:
-    _, mask = cv2.estimateAffine2D(a, b, _usac(settings))
+        _, mask = cv2.estimateAffine2D(a, b, _usac(settings))
+    else:
+        _, mask = cv2.findHomography(a, b, _usac(settings))
     return _as_mask(mask, len(a))
 
 

@@ -139,10 +139,7 @@ class HybridTracker:
             verdict = Verdict.AREA
         elif self._frames_lost and np.mean(found.is_inlier) < _MIN_RETURN_SHARE:
             verdict = Verdict.LOW_CORRELATION
-        if verdict is Verdict.OK:
-            return alignment
-        refusal = refused(verdict, len(found.is_inlier), found.is_inlier)
-        return replace(alignment, registration=refusal)
+        return alignment if verdict is Verdict.OK else _refused(alignment, verdict)
 
     def _learn_surprise(self, expected: Matrix, found: Matrix) -> None:
         """How far the corners are from their prediction, averaged over the last frames."""
@@ -164,10 +161,8 @@ class HybridTracker:
             found.b_from_a,
             _COLOR_REACH_SHARE * float(np.sqrt(abs(geometry.signed_area(self.template.quad)))),
         )
-        if distance <= self._max_chroma_distance:
-            return alignment
-        refusal = refused(Verdict.OTHER_COLORS, len(found.is_inlier), found.is_inlier)
-        return replace(alignment, registration=refusal)
+        is_like = distance <= self._max_chroma_distance
+        return alignment if is_like else _refused(alignment, Verdict.OTHER_COLORS)
 
     def _detect(self, view: FrameView) -> tuple[Registration, Evidence, str]:
         """By features: near the last place in the first lost frame, then everywhere.
@@ -199,8 +194,8 @@ class HybridTracker:
         found = alignment.registration
         assert found.b_from_a is not None
         if self._pose is not None and self._frames_lost == 0 and means == "flow":
-            has_one_shape = self._settings.registration.model == "translation"
-            model = Model.TRANSLATION if has_one_shape else Model.SIMILARITY
+            only_shifts = self._settings.registration.model == "translation"
+            model = Model.TRANSLATION if only_shifts else Model.SIMILARITY
             self._step_pose = _shared_motion(model, self.template.quad, self._pose, found.b_from_a)
         else:
             self._step_pose = None
@@ -211,6 +206,12 @@ class HybridTracker:
         return make_track(
             self.template, found, evidence, means, self._was_seen, alignment.correlation
         )
+
+
+def _refused(alignment: Alignment, verdict: Verdict) -> Alignment:
+    """The alignment with its pose taken back, for the reason given."""
+    is_inlier = alignment.registration.is_inlier
+    return replace(alignment, registration=refused(verdict, len(is_inlier), is_inlier))
 
 
 def _shared_motion(model: Model, quad: Points, before: Matrix, after: Matrix) -> Matrix:

@@ -19,12 +19,18 @@ Descriptor: TypeAlias = Literal["freak", "brisk", "orb", "teblid", "sift", "akaz
 Method: TypeAlias = Literal["hybrid", "detect"]
 ModelChoice: TypeAlias = Literal["auto", "homography", "affine", "similarity", "translation"]
 CameraMode: TypeAlias = Literal["fixed", "moving"]
+Warping: TypeAlias = Literal["nearest", "linear", "cubic", "lanczos"]
+Blending: TypeAlias = Literal["none", "average", "feather", "multiband"]
+Projection: TypeAlias = Literal["auto", "planar", "cylindrical", "spherical"]
 
 DETECTORS: tuple[str, ...] = get_args(Detector)
 DESCRIPTORS: tuple[str, ...] = get_args(Descriptor)
 METHODS: tuple[str, ...] = get_args(Method)
 MODELS: tuple[str, ...] = get_args(ModelChoice)
 CAMERA_MODES: tuple[str, ...] = get_args(CameraMode)
+WARPINGS: tuple[str, ...] = get_args(Warping)
+BLENDINGS: tuple[str, ...] = get_args(Blending)
+PROJECTIONS: tuple[str, ...] = get_args(Projection)
 
 
 class VideoMode(StrEnum):
@@ -100,6 +106,31 @@ class RecordingSettings(_Section):
     )
 
 
+class MosaicSettings(_Section):
+    """Mosaics of pictures and of streams."""
+
+    warping: Warping = "linear"
+    blending: Blending = "multiband"
+    projection: Projection = "auto"
+    max_megapixels: float = Field(
+        default=100.0, gt=0, allow_inf_nan=False, description="largest canvas that is written"
+    )
+    max_memory_mb: float = Field(
+        default=400.0,
+        gt=0,
+        allow_inf_nan=False,
+        description="tiles kept in memory; more go to disk",
+    )
+
+
+class LiveSettings(_Section):
+    """Cameras and network streams."""
+
+    max_fps: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    stall_timeout_s: float = Field(default=5.0, gt=0, allow_inf_nan=False)
+    retries: int | None = Field(default=None, ge=0, description="None = for ever")
+
+
 class Settings(_Section):
     """All of them."""
 
@@ -109,6 +140,8 @@ class Settings(_Section):
     tracker: TrackerSettings = TrackerSettings()
     camera: CameraMode = "fixed"
     recording: RecordingSettings = RecordingSettings()
+    mosaic: MosaicSettings = MosaicSettings()
+    live: LiveSettings = LiveSettings()
 
 
 _NAMES = {
@@ -118,6 +151,9 @@ _NAMES = {
     "model": MODELS,
     "camera": CAMERA_MODES,
     "video": tuple(VideoMode),
+    "warping": WARPINGS,
+    "blending": BLENDINGS,
+    "projection": PROJECTIONS,
 }
 
 

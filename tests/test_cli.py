@@ -299,7 +299,7 @@ def test_no_output_replaces_the_source_or_another(
 def test_two_runs_in_one_second_do_not_share_a_recording(
     run: Run, clip: Path, target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cli.time, "strftime", lambda _: "20260101-000000")
+    monkeypatch.setattr("time.strftime", lambda _: "20260101-000000")
     for _ in range(2):
         assert run("track", clip, "--target", target, "--frames", 1, "--quiet") == 0
     names = sorted(p.name for p in (tmp_path / "recordings").iterdir())

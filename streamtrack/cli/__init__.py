@@ -1,0 +1,89 @@
+"""The command line, one file a command; the only package that talks to Typer.
+
+Heavy modules are imported where they are used, so that --help is instant.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import typer
+
+from streamtrack.cli.bench import bench_app
+from streamtrack.cli.tools import synth, view
+from streamtrack.cli.track import track
+from streamtrack.errors import StreamtrackError, UsageError
+
+__all__ = ["app", "exit_on_error", "main"]
+
+app = typer.Typer(
+    name="streamtrack",
+    help="Track objects in video by local features and homographies; see why in Rerun.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+app.command()(track)
+app.command()(synth)
+app.command()(view)
+app.add_typer(bench_app, name="bench")
+
+
+def main() -> None:
+    """Run the program."""
+    # Rerun's own log lines: what matters of them is said in ours, in one line.
+    os.environ.setdefault("RUST_LOG", "off")
+    # Its allocator shall hand memory back at once: runs last for weeks.
+    os.environ.setdefault("MIMALLOC_PURGE_DELAY", "0")
+    exit_on_error(lambda: app(standalone_mode=False))
+
+
+def exit_on_error(run: Callable[[], Any]) -> None:
+    """Call ``run``; exit with 2 for wrong usage and 1 for any failure, each said in one line."""
+    from typer.exceptions import Abort, TyperException
+
+    try:
+        result = run()
+        if isinstance(result, int):
+            sys.exit(result)
+    except TyperException as error:
+        if not sys.argv[1:]:
+            sys.stderr.write(f"{error.format_message()}\n")  # the help
+            sys.exit(error.exit_code)
+        _fail(f"{error.format_message().rstrip('.')}; see streamtrack --help", error.exit_code)
+    except UsageError as error:
+        _fail(error, 2)
+    except StreamtrackError as error:
+        _fail(error, 1)
+    except (Abort, KeyboardInterrupt):
+        _fail("interrupted", 1)
+    except BrokenPipeError:
+        # Nobody reads our output any more; keep Python from complaining while it shuts down.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+
+
+def _fail(message: object, code: int) -> None:
+    sys.stderr.write(f"streamtrack: error: {message}\n")
+    sys.exit(code)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"streamtrack {version('streamtrack')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Track objects in video by local features and homographies; see why in Rerun."""

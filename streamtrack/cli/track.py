@@ -1,0 +1,112 @@
+"""`streamtrack track`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from streamtrack.cli.common import (
+    DESCRIPTORS,
+    DETECTORS,
+    StopOnSignal,
+    consoles,
+    default_recording,
+    merged_settings,
+    print_summary,
+    progress_for,
+    warnings_shown,
+)
+from streamtrack.errors import UsageError
+
+
+def track(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="SOURCE",
+            help="Video file, folder or glob of pictures, or synthetic://SCENE?seed=1&frames=300.",
+        ),
+    ],
+    target: Annotated[
+        list[str],
+        typer.Option(
+            help="[NAME=]x,y,w,h or [NAME=]x1,y1,...,x4,y4 in pixels of the first frame, or "
+            "[NAME=]PICTURE[@region of it] to search for. May repeat.",
+        ),
+    ],
+    method: Annotated[
+        str | None,
+        typer.Option(help="hybrid (predict, warp back, flow) or detect (every frame by itself)."),
+    ] = None,
+    camera: Annotated[str | None, typer.Option(help="fixed or moving.")] = None,
+    detector: Annotated[str | None, typer.Option(help=f"{DETECTORS}.")] = None,
+    threshold: Annotated[float | None, typer.Option(help="The detector's own threshold.")] = None,
+    descriptor: Annotated[str | None, typer.Option(help=f"{DESCRIPTORS}.")] = None,
+    model: Annotated[
+        str | None,
+        typer.Option(help="auto, homography, affine, similarity or translation."),
+    ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(help="Recording; default recordings/<source>-<start time>.rrd."),
+    ] = None,
+    no_record: Annotated[bool, typer.Option("--no-record", help="Make no recording.")] = False,
+    record_video: Annotated[
+        str | None,
+        typer.Option(help="Picture in the recording: auto (copy packets), jpeg, av1 or none."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(help="Table of tracks: .csv, .jsonl, .parquet, or .txt (MOT)."),
+    ] = None,
+    poses: Annotated[Path | None, typer.Option(help="CSV of the camera's poses.")] = None,
+    video: Annotated[
+        Path | None, typer.Option(help="Annotated copy: .mp4, .mkv, .webm, .avi.")
+    ] = None,
+    summary: Annotated[Path | None, typer.Option(help="Summary as JSON.")] = None,
+    settings: Annotated[Path | None, typer.Option(help="Settings as TOML; flags win.")] = None,
+    start: Annotated[int, typer.Option(min=0, help="First frame, counted from 0.")] = 0,
+    step: Annotated[int, typer.Option(min=1, help="Use every n-th frame.")] = 1,
+    frames: Annotated[int | None, typer.Option(min=1, help="Use at most n frames.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
+) -> None:
+    """Follow targets through a video and write a recording, tables and a summary."""
+    chosen = merged_settings(
+        settings,
+        {
+            "features": {"detector": detector, "threshold": threshold, "descriptor": descriptor},
+            "registration": {"model": model},
+            "tracker": {"method": method},
+            "camera": camera,
+            "recording": {"video": record_video},
+        },
+    )
+    from streamtrack.job import Outputs, TrackJob, run_track
+    from streamtrack.targets import parse_targets
+
+    if no_record and record is not None:
+        raise UsageError("--record and --no-record contradict each other: give one of them")
+    if not no_record and record is None:
+        record = default_recording(source)
+    job = TrackJob(
+        source,
+        parse_targets(target),
+        chosen,
+        Outputs(None if no_record else record, output, poses, video, summary),
+        start,
+        step,
+        frames,
+    )
+    console, errors = consoles()
+    with (
+        warnings_shown(errors, quiet),
+        progress_for(errors, quiet) as progress,
+        StopOnSignal() as stop,
+    ):
+        outcome = run_track(job, progress, stop)
+    if not quiet:
+        print_summary(console, outcome.summary.rows(), job.outputs.record)
+    if outcome.error is not None:
+        raise outcome.error

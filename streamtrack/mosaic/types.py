@@ -1,0 +1,114 @@
+"""The values that mosaics are made of. Conventions as in `streamtrack.types`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from streamtrack.types import (
+    Features,
+    Image,
+    Matches,
+    Matrix,
+    Model,
+    Points,
+    Registration,
+    Size,
+    Verdict,
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """One picture to be placed in a mosaic, with its features (full-resolution pixels).
+
+    ``index`` is its place among the inputs (command line, or frame of the stream) from 0.
+    """
+
+    index: int
+    name: str
+    image: Image
+    features: Features
+
+    @property
+    def size_wh(self) -> Size:
+        return self.image.shape[1], self.image.shape[0]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Link:
+    """A gated mapping between pictures ``a`` and ``b`` (their indices), with its evidence.
+
+    ``a_points`` and ``b_points``, float32 (M, 2), are the pairs the estimate rests on (sub-pixel,
+    full-resolution pixels), ``registration.is_inlier`` (M,) tells which agree and
+    ``registration.b_from_a`` is None when refused. ``matches`` counts the pairs of the descriptor
+    matching itself. ``rmse_px`` is the inliers' symmetric transfer RMSE, ``overlap_ncc`` the
+    normalised cross-correlation of the two pictures where they overlap; NaN if not measured.
+    """
+
+    a: int
+    b: int
+    a_points: Points
+    b_points: Points
+    registration: Registration
+    matches: Matches
+    rmse_px: float = float("nan")
+    overlap_ncc: float = float("nan")
+
+    @property
+    def b_from_a(self) -> Matrix | None:
+        return self.registration.b_from_a
+
+    @property
+    def model(self) -> Model | None:
+        return self.registration.model
+
+    @property
+    def verdict(self) -> Verdict:
+        return self.registration.verdict
+
+
+class Status(StrEnum):
+    """What became of a picture or frame."""
+
+    USED = "used"
+    SKIPPED = "skipped"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placement:
+    """Where a picture came to lie; ``world_from_picture`` is None if skipped, with the reason."""
+
+    index: int
+    name: str
+    features: int
+    status: Status
+    reason: str = ""
+    world_from_picture: Matrix | None = None
+    time_s: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeEdge:
+    """A verified link between keyframes ``a`` and ``b``; ``is_loop`` if it closed a loop."""
+
+    a: int
+    b: int
+    inliers: int
+    rmse_px: float
+    is_loop: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MosaicView:
+    """A growing mosaic as a person may see it at one moment.
+
+    ``preview`` is bounded in size; ``world_from_preview`` maps its pixels to the world.
+    ``keyframe_outlines`` (K, 4, 2) and ``frame_outline`` (4, 2) are in world pixels.
+    """
+
+    preview: Image
+    world_from_preview: Matrix
+    frame_outline: Points | None
+    keyframe_outlines: Points
+    edges: tuple[KeyframeEdge, ...] = field(default=())

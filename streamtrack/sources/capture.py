@@ -1,0 +1,65 @@
+"""What a live device promises to the loop that reads it (`streamtrack.sources.live`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Protocol, Self
+
+from streamtrack.errors import SourceError
+from streamtrack.types import Image, Packet, SourceInfo
+
+
+class CaptureEndedError(SourceError):
+    """The device or the peer is gone, or the stream is broken: close it and open it again."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Captured:
+    """One picture as a device delivered it.
+
+    ``time_s`` is on the device's own clock (driver stamp, pts x time base); ``captured_s`` is the
+    moment of capture on `time.monotonic`'s clock, as near as the device tells. ``lost`` counts the
+    pictures that the device reports lost since the one before, ``damaged`` those that were
+    rejected.
+    """
+
+    image: Image
+    time_s: float
+    captured_s: float
+    lost: int = 0
+    damaged: int = 0
+    packets: tuple[Packet, ...] = ()
+
+
+class Capture(Protocol):
+    """An open live device; one that fails to open leaves nothing behind.
+
+    The constructor raises SourceError (device missing, busy, forbidden: nothing to read) or
+    UsageError (an address that cannot be right, so that trying again is pointless).
+    """
+
+    @property
+    def info(self) -> SourceInfo:
+        """What was granted: size, rate, codec."""
+        ...
+
+    def read(self, timeout_s: float) -> Captured | None:
+        """The next picture, or None if none came in time. Raises CaptureEndedError when it is over.
+
+        Always returns or raises within about ``timeout_s``, whatever the device does.
+        """
+        ...
+
+    def close(self) -> None:
+        """Give everything back, within two seconds, whatever the device does."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None: ...

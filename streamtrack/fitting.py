@@ -94,9 +94,18 @@ def _fit_affine(a: Doubles, b: Doubles, w: Doubles) -> Matrix:
     mean_a, mean_b = _mean(a, w), _mean(b, w)
     centred = a - mean_a
     weighted = (centred * w[:, None]).T
-    # The pseudo-inverse leaves alone what collinear points do not determine.
-    linear = (np.linalg.pinv(weighted @ centred) @ (weighted @ (b - mean_b))).T
+    linear = (_pseudo_inverse(weighted @ centred) @ (weighted @ (b - mean_b))).T
     return _affine_matrix(linear, mean_b - linear @ mean_a)
+
+
+def _pseudo_inverse(symmetric: Doubles) -> Doubles:
+    """Pseudo-inverse of a (2, 2) matrix, which leaves alone what collinear points leave open."""
+    (a, b), (_, d) = symmetric.tolist()
+    determinant = a * d - b * b
+    if determinant > 1e-9 * (a + d) ** 2:
+        inverse: Doubles = np.array([[d, -b], [-b, a]]) / determinant
+        return inverse
+    return np.asarray(np.linalg.pinv(symmetric), np.float64)
 
 
 def _mean(points: Doubles, weights: Doubles) -> Doubles:
@@ -157,17 +166,32 @@ def gauss_newton_step(start: Matrix, a: Doubles, b: Doubles, weights: Doubles) -
     """``start`` moved by one step on the weighted transfer error in b.
 
     The DLT minimises an algebraic error, this the geometric one (Hartley & Zisserman, section
-    4.2.3; Jacobian of equation 4.21). Columns are scaled to unit length for conditioning.
+    4.2.3). A pair's Jacobian (equation 4.21) is [ray 0 -u ray_xy; 0 ray -v ray_xy] with
+    ray = (x, y, 1) / depth, so the normal equations are summed block by block. Parameters are
+    scaled to a unit diagonal for conditioning.
     """
     homogeneous, residual = _residuals(start, a, b)
-    jacobian = _homography_jacobian(a, homogeneous) * start[2, 2]
-    length = np.sqrt(np.einsum("ij,ij->j", jacobian, jacobian)) + 1e-300
-    jacobian /= length
-    weighted = jacobian * np.repeat(weights, 2)[:, None]
-    normal = weighted.T @ jacobian
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse_depth = (start[2, 2] / homogeneous[:, 2])[:, None]
+        u, v = (homogeneous[:, :2] / homogeneous[:, 2:]).T
+    ray = np.concatenate([a * inverse_depth, inverse_depth], axis=1)
+    weighted = ray * weights[:, None]
+    by_depth = np.concatenate([-u[:, None] * ray[:, :2], -v[:, None] * ray[:, :2]])
+    weighted_by_depth = by_depth * np.concatenate([weights, weights])[:, None]
+    count = len(a)
+    normal, gradient = np.zeros((8, 8)), np.zeros(8)
+    normal[0:3, 0:3] = normal[3:6, 3:6] = weighted.T @ ray
+    normal[0:3, 6:8] = weighted.T @ by_depth[:count]
+    normal[3:6, 6:8] = weighted.T @ by_depth[count:]
+    normal[6:8, 0:6] = normal[0:6, 6:8].T
+    normal[6:8, 6:8] = weighted_by_depth.T @ by_depth
+    gradient[0:6] = (weighted.T @ residual).T.ravel()
+    gradient[6:8] = weighted_by_depth.T @ residual.T.ravel()
+    length = np.sqrt(np.diagonal(normal)) + 1e-300
+    normal /= length[:, None] * length
     normal[np.diag_indices(8)] *= 1 + 1e-9
     try:
-        change = np.linalg.solve(normal, weighted.T @ residual.reshape(-1)) / length
+        change = np.linalg.solve(normal, gradient / length) / length
     except np.linalg.LinAlgError:
         return start
     moved = start / start[2, 2] + np.append(change, 0.0).reshape(3, 3)
@@ -179,20 +203,6 @@ def _residuals(b_from_a: Matrix, a: Doubles, b: Doubles) -> tuple[Doubles, Doubl
     with np.errstate(divide="ignore", invalid="ignore"):
         mapped = homogeneous[:, :2] / homogeneous[:, 2:]
     return homogeneous, b - mapped
-
-
-def _homography_jacobian(a: Doubles, homogeneous: Doubles) -> Doubles:
-    """d(u, v) / d(h11 .. h32), shape (2 M, 8), rows u0, v0, u1, v1 ..."""
-    x, y = a.T
-    inverse_depth = 1 / homogeneous[:, 2]
-    u, v = (homogeneous[:, :2] * inverse_depth[:, None]).T
-    jacobian = np.zeros((len(a), 2, 8))
-    ray = np.stack([x, y, np.ones(len(a))], axis=1) * inverse_depth[:, None]
-    jacobian[:, 0, 0:3] = ray
-    jacobian[:, 1, 3:6] = ray
-    jacobian[:, 0, 6:8] = -u[:, None] * ray[:, :2]
-    jacobian[:, 1, 6:8] = -v[:, None] * ray[:, :2]
-    return jacobian.reshape(-1, 8)
 
 
 def transfer_errors(b_from_a: Matrix, a: Points, b: Points) -> Doubles:

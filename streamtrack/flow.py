@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.blur import motion_blur, with_best_length
-from streamtrack.fitting import poorest_model, transfer_errors
+from streamtrack.fitting import fit, gauss_newton_step, poorest_model, transfer_errors
 from streamtrack.frame_view import FrameView
 from streamtrack.refine import Prior, refined
 from streamtrack.registration import Effort, judge_mapping, refused, register
@@ -34,6 +34,9 @@ _NOISE_VARIANCE = 9.0  # grey levels squared
 _SEARCH_PX = 12.0  # how far, in patch pixels, a flow may reach: the area for chance agreement
 _INLIER_PX = 1.5  # patch pixels
 _COARSE_STEPS = 2  # patches between the fine and the coarse alignment: half the resolution
+_CLEAR = 0.8  # share of the points in view that agree
+_POINT_SIGMA_PX = 0.5  # patch pixels
+_HOLDING_STEPS = 2
 _ROUGH = Effort((Model.AFFINE,), 0)
 _QUICK = Effort((Model.AFFINE, Model.HOMOGRAPHY), 1)
 
@@ -75,37 +78,52 @@ class FlowAligner:
         self._coarse_flow = _make_flow()
         self._fine_flow = _make_flow()
 
-    def align(self, view: FrameView, guess: Matrix, sigma_px: float | None = None) -> Alignment:
+    def align(
+        self,
+        view: FrameView,
+        guess: Matrix,
+        sigma_px: float | None = None,
+        is_calm: bool = False,
+    ) -> Alignment:
         """The pose near ``guess`` (frame_from_template): first coarse, then fine, then refined.
 
         ``sigma_px`` says how far from the guess the corners usually turn out to be, if known.
+        ``is_calm`` says that the guess is good and nothing moves fast enough to be smeared: the
+        coarse alignment is then left out as long as the fine one finds the target clearly.
         """
         template = self._template
-        fine = patch_for(template, guess)
-        coarse = min(fine + _COARSE_STEPS, len(template.patches) - 1)
+        coarsest = len(template.patches) - 1
+        fine = min(patch_for(template, guess) + view.work.patch_steps, coarsest)
+        coarse = min(fine + _COARSE_STEPS, coarsest)
         pose, patch = guess, template.patches[fine]
+        prior = None if sigma_px is None else Prior(guess, template.quad, sigma_px)
+        if is_calm:
+            found = self._flow_step(view, patch, pose, self._fine_flow, _QUICK, prior)
+            if _is_clear(found):
+                return self._refined(view, patch, found, prior)
         if coarse > fine:
-            rough, smear = self._roughly(view, template.patches[coarse], guess)
+            rough, smear = self._roughly(view, template.patches[coarse], guess, prior)
             if rough.registration.b_from_a is None:
                 return rough
             pose = rough.registration.b_from_a
             if smear.any():
                 patch = patch.smeared(smear * (patch.scale / template.patches[coarse].scale))
-        found = self._flow_step(view, patch, pose, self._fine_flow, _QUICK)
-        prior = None if sigma_px is None else Prior(guess, template.quad, sigma_px)
+        found = self._flow_step(view, patch, pose, self._fine_flow, _QUICK, prior)
         return self._refined(view, patch, found, prior)
 
     def _roughly(
-        self, view: FrameView, patch: Patch, guess: Matrix
+        self, view: FrameView, patch: Patch, guess: Matrix, prior: Prior | None
     ) -> tuple[Alignment, npt.NDArray[np.float64]]:
         """The coarse alignment, and the motion blur under which it was found, in patch pixels."""
-        sharp = self._flow_step(view, patch, guess, self._coarse_flow, _ROUGH)
+        sharp = self._flow_step(view, patch, guess, self._coarse_flow, _ROUGH, prior)
         pose = sharp.registration.b_from_a
         seen = _warp_back(view, patch, guess if pose is None else pose)
         smear = motion_blur(patch.image, seen.image, _near(patch, seen.visible))
         if not smear.any():
             return sharp, smear
-        smeared = self._flow_step(view, patch.smeared(smear), guess, self._coarse_flow, _ROUGH)
+        smeared = self._flow_step(
+            view, patch.smeared(smear), guess, self._coarse_flow, _ROUGH, prior
+        )
         pose = smeared.registration.b_from_a
         if pose is None or smeared.registration.inliers < sharp.registration.inliers:
             return sharp, np.zeros(2)
@@ -127,7 +145,7 @@ class FlowAligner:
             patch.gradients,
             self._shown(patch, found),
             registration.model,
-            prior,
+            None if prior is None else prior.against(float(np.mean(registration.is_inlier))),
         )
         if pose is None or judge_mapping(pose, self._template.quad) is not Verdict.OK:
             pose = registration.b_from_a
@@ -153,6 +171,7 @@ class FlowAligner:
         pose: Matrix,
         flow: cv2.DISOpticalFlow,
         effort: Effort,
+        prior: Prior | None = None,
     ) -> Alignment:
         warp = _warp_back(view, patch, pose)
         visible = warp.visible
@@ -167,7 +186,7 @@ class FlowAligner:
         frame_points = geometry.transform_points(warp.frame_from_patch, moved)
         correlation = _local_correlation(patch.image, _warped_by(image, field))[rows, columns]
         is_like = correlation >= _MIN_CORRELATION
-        registration = self._estimate(patch, warp, moved, is_like, effort)
+        registration = self._estimate(patch, warp, moved, is_like, effort, prior)
         supported = registration.is_inlier
         share = np.count_nonzero(supported) / len(supported)
         mean = float(correlation[supported].mean()) if supported.any() else float("nan")
@@ -182,6 +201,7 @@ class FlowAligner:
         moved: Points,
         is_like: Mask,
         effort: Effort,
+        prior: Prior | None,
     ) -> Registration:
         """frame_from_template, from where the patch's points in view have moved in the warp.
 
@@ -200,14 +220,46 @@ class FlowAligner:
         is_inlier[np.flatnonzero(is_like)[found.is_inlier]] = True
         if found.b_from_a is None:
             return replace(found, is_inlier=is_inlier)
+        seen_from_patch = found.b_from_a
+        if prior is not None and found.model is not None and np.mean(is_inlier) < _CLEAR:
+            pairs = patch.points[warp.visible][is_inlier], moved[is_inlier]
+            held = prior.against(float(np.mean(is_inlier)))
+            seen_from_patch = _held_by(held, found.model, *pairs, patch, warp)
         pose = geometry.normalized(
-            warp.frame_from_patch @ found.b_from_a @ patch.patch_from_template
+            warp.frame_from_patch @ seen_from_patch @ patch.patch_from_template
         )
         verdict = judge_mapping(pose, self._template.quad)
         if verdict is not Verdict.OK:
             return refused(verdict, len(moved), is_inlier)
         rmse_px = found.rmse_px * warp.frame_px
         return Registration(Verdict.OK, pose, found.model, is_inlier, rmse_px)
+
+
+def _held_by(
+    prior: Prior, model: Model, points: Points, moved: Points, patch: Patch, warp: _Warp
+) -> Matrix:
+    """The mapping of the points to where they moved, the expected corners being four more pairs.
+
+    Where points are seen all around they hardly matter; a corner far from any point, to which a
+    mapping would extrapolate, stays where motion says that it is.
+    """
+    patch_from_frame = geometry.inverted(warp.frame_from_patch)
+    corners = geometry.transform_points(patch.patch_from_template, prior.corners)
+    expected = geometry.transform_points(patch_from_frame @ prior.pose, prior.corners)
+    corner_weight = (_POINT_SIGMA_PX * warp.frame_px / prior.sigma_px) ** 2
+    a, b = np.concatenate([points, corners]), np.concatenate([moved, expected])
+    weights = np.concatenate([np.ones(len(points)), np.full(4, corner_weight)])
+    if model is not Model.HOMOGRAPHY:
+        return fit(model, a, b, weights)
+    mapping = fit(Model.AFFINE, a, b, weights)
+    for _ in range(_HOLDING_STEPS):
+        mapping = gauss_newton_step(mapping, a.astype(np.float64), b.astype(np.float64), weights)
+    return mapping
+
+
+def _is_clear(found: Alignment) -> bool:
+    registration = found.registration
+    return registration.verdict is Verdict.OK and float(np.mean(registration.is_inlier)) > _CLEAR
 
 
 def _near(patch: Patch, rows: Mask) -> Mask:
@@ -293,15 +345,12 @@ def _local_correlation(a: Image, b: Image) -> Floats:
     The variance of plain noise is added to the denominator, so flat windows score zero.
     """
     window = (_CORRELATION_WINDOW, _CORRELATION_WINDOW)
-    fa, fb = a.astype(np.float32), b.astype(np.float32)
-
-    def mean(values: Floats) -> Floats:
-        return np.asarray(cv2.boxFilter(values, -1, window), np.float32)
-
-    mean_a, mean_b = mean(fa), mean(fb)
-    covariance = mean(fa * fb) - mean_a * mean_b
-    variance_a = mean(fa * fa) - mean_a * mean_a + _NOISE_VARIANCE
-    variance_b = mean(fb * fb) - mean_b * mean_b + _NOISE_VARIANCE
+    mean_a, mean_b = (cv2.boxFilter(image, cv2.CV_32F, window) for image in (a, b))
+    square_a, square_b = (cv2.sqrBoxFilter(image, cv2.CV_32F, window) for image in (a, b))
+    product = cv2.multiply(a, b, dtype=cv2.CV_32F)
+    covariance = cv2.boxFilter(product, -1, window) - mean_a * mean_b
+    variance_a = square_a - mean_a * mean_a + _NOISE_VARIANCE
+    variance_b = square_b - mean_b * mean_b + _NOISE_VARIANCE
     return np.asarray(covariance / np.sqrt(variance_a * variance_b), np.float32)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 
 from streamtrack import geometry
+from streamtrack.budget import FULL_WORK, WorkLevel
 from streamtrack.features import FeatureExtractor
 from streamtrack.pyramid import Pyramid
 from streamtrack.types import Features, Frame, Image, Size
@@ -13,8 +14,11 @@ from streamtrack.types import Features, Frame, Image, Size
 class FrameView:
     """Grey pyramid and features of one frame, shared by all targets and the camera."""
 
-    def __init__(self, frame: Frame, extractor: FeatureExtractor) -> None:
+    def __init__(
+        self, frame: Frame, extractor: FeatureExtractor, work: WorkLevel = FULL_WORK
+    ) -> None:
         self.frame = frame
+        self.work = work
         self._extractor = extractor
         self.pyramid = Pyramid(geometry.grey_of(frame.image))
         self._features: Features | None = None

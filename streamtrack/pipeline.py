@@ -9,6 +9,7 @@ from itertools import islice
 import numpy as np
 
 from streamtrack import geometry
+from streamtrack.budget import LEVELS, Budget
 from streamtrack.camera import make_camera
 from streamtrack.errors import TargetError, UsageError
 from streamtrack.features import FeatureExtractor
@@ -37,16 +38,18 @@ def track(
     that frame, SourceError when the source breaks, UsageError if it has no frame ``start``.
     """
     settings = settings or Settings()
-    extractor = FeatureExtractor(settings.features)
+    extractors = _extractors(settings)
+    budget = Budget(settings.tracker.budget_ms)
     trackers: list[TargetTracker] = []
     camera = make_camera(settings)
     stop = None if frames is None else start + max(0, (frames - 1) * step + 1)
     is_first = True
     for frame in islice(source, start, stop, step):
         began = time.perf_counter()
-        view = FrameView(frame, extractor)
+        work = budget.level
+        view = FrameView(frame, extractors[work.index], work)
         if is_first:
-            trackers = [make_tracker(target, view, extractor, settings) for target in targets]
+            trackers = [make_tracker(target, view, extractors[0], settings) for target in targets]
             is_first = False
         tracks, track_ms = _follow_all(trackers, view)
         camera_began = time.perf_counter()
@@ -57,9 +60,20 @@ def track(
             stage_ms["detect"] = view.detect_ms
         if settings.camera != "fixed":
             stage_ms["camera"] = (ended - camera_began) * 1e3
-        yield Step(frame, tracks, pose, view.detected, stage_ms)
+        budget.note(stage_ms["total"])
+        yield Step(frame, tracks, pose, view.detected, stage_ms, work.index)
     if is_first and start > 0 and frames != 0:
         raise UsageError(f"the source has no frame {start}: it ended before")
+
+
+def _extractors(settings: Settings) -> list[FeatureExtractor]:
+    """One for each level of work; the first finds all the features that the settings ask for."""
+    most = settings.features.max_features
+    counts = [max(8, round(most * level.feature_share)) for level in LEVELS]
+    return [
+        FeatureExtractor(settings.features.model_copy(update={"max_features": count}))
+        for count in counts
+    ]
 
 
 def _follow_all(

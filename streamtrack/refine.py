@@ -9,7 +9,7 @@ out, and residuals are weighted by Tukey's biweight, so that occluders and highl
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -21,6 +21,7 @@ from streamtrack.types import Image, Mask, Matrix, Model, Points
 
 Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
+
 
 _PIXELS = 3500
 _MIN_PIXELS = 150
@@ -87,6 +88,10 @@ class Prior:
     corners: Points
     sigma_px: float
 
+    def against(self, trust: float) -> Prior:
+        """The prior as it stands against evidence of which only a share ``trust`` is undisputed."""
+        return replace(self, sigma_px=self.sigma_px * trust)
+
 
 def refined(
     warp_back: Callable[[Matrix], Image],
@@ -108,28 +113,29 @@ def refined(
     index, values = gradients.index[support], gradients.values[support]
     basis = _BASES[model]
     jacobian = gradients.jacobian[support] @ basis.astype(np.float32)
+    unit_from_patch = gradients.unit_from_patch
+    patch_from_unit = inverted(unit_from_patch)
+    template_from_patch = inverted(patch_from_template)
+    expected = _expectation(prior, pose, unit_from_patch @ patch_from_template) if prior else None
     moved_px = 0.0
     for _ in range(_ROUNDS):
         image = warp_back(pose)
         normal, gradient = _normal_equations(jacobian, values, _high_passed(image).ravel()[index])
-        unit_from_patch = gradients.unit_from_patch
-        if prior is not None:
-            unit_from_template = unit_from_patch @ patch_from_template
-            prior_normal, prior_gradient = _prior_equations(prior, pose, unit_from_template)
-            normal = normal + basis.T @ prior_normal @ basis
-            gradient = gradient + basis.T @ prior_gradient
+        if expected is not None:
+            normal = normal + basis.T @ expected.normal @ basis
+            gradient = gradient + basis.T @ expected.gradient(pose)
         try:
             step = np.linalg.solve(normal, gradient)
         except np.linalg.LinAlgError:
             return None
         unit_step = np.eye(3) + np.append(basis @ step, 0.0).reshape(3, 3)
-        patch_step = inverted(unit_from_patch) @ unit_step @ unit_from_patch
+        patch_step = patch_from_unit @ unit_step @ unit_from_patch
         corners = image_quad((image.shape[1], image.shape[0]))
         change_px = float(np.abs(transform_points(patch_step, corners) - corners).max())
         moved_px += change_px
         if not moved_px < _MAX_MOVE_SHARE * max(image.shape):
             return None
-        pose = pose @ inverted(patch_from_template) @ inverted(patch_step) @ patch_from_template
+        pose = pose @ template_from_patch @ inverted(patch_step) @ patch_from_template
         if change_px < _CONVERGED_PX:
             break
     return normalized(pose)
@@ -154,25 +160,42 @@ def _median_size(values: Floats) -> float:
     return float(np.partition(sizes, middle)[middle])
 
 
-def _prior_equations(
-    prior: Prior, pose: Matrix, unit_from_template: Matrix
-) -> tuple[Doubles, Doubles]:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Expectation:
     """What the expected corners add to the information, in unit coordinates.
 
     The step's inverse is applied to the pose, so it should take each corner's expected place,
     seen through the pose, to the corner itself.
     """
+
+    corners: Doubles
+    template_corners: Points
+    rows: Doubles
+    normal: Doubles
+    weight: float
+    expected_pose: Matrix
+    unit_from_template: Matrix
+
+    def gradient(self, pose: Matrix) -> Doubles:
+        unit_from_frame = self.unit_from_template @ inverted(pose)
+        seen = transform_points(unit_from_frame @ self.expected_pose, self.template_corners)
+        wanted = (self.corners - seen).T.ravel() * self.weight
+        gradient: Doubles = self.rows.T @ wanted
+        return gradient
+
+
+def _expectation(prior: Prior, pose: Matrix, unit_from_template: Matrix) -> _Expectation:
     corners = transform_points(unit_from_template, prior.corners).astype(np.float64)
-    unit_from_frame = unit_from_template @ inverted(pose)
-    expected = transform_points(unit_from_frame @ prior.pose, prior.corners).astype(np.float64)
     frame_px = local_scale(pose @ inverted(unit_from_template), corners.mean(axis=0))
     x, y = corners.T
     one, zero = np.ones(4), np.zeros(4)
     rows_x = np.stack([x, y, one, zero, zero, zero, -x * x, -x * y], axis=1)
     rows_y = np.stack([zero, zero, zero, x, y, one, -x * y, -y * y], axis=1)
-    rows = np.concatenate([rows_x, rows_y]) * (frame_px / prior.sigma_px)
-    wanted = (corners - expected).T.ravel() * (frame_px / prior.sigma_px)
-    return rows.T @ rows, rows.T @ wanted
+    weight = frame_px / prior.sigma_px
+    rows = np.concatenate([rows_x, rows_y]) * weight
+    return _Expectation(
+        corners, prior.corners, rows, rows.T @ rows, weight, prior.pose, unit_from_template
+    )
 
 
 def _derivatives(image: Image) -> tuple[Floats, Floats, Floats]:

@@ -8,11 +8,12 @@ from __future__ import annotations
 import tomllib
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, Self, TypeAlias, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from streamtrack.errors import UsageError, unknown_name
+from streamtrack.rotation import check_keep, parse_keep, parse_rotate
 
 Detector: TypeAlias = Literal["harris", "fast", "agast", "gftt", "brisk", "orb", "sift", "akaze"]
 Descriptor: TypeAlias = Literal["freak", "brisk", "orb", "teblid", "sift", "akaze"]
@@ -94,6 +95,9 @@ class TrackerSettings(_Section):
     """Following of targets."""
 
     method: Method = "hybrid"
+    budget_ms: float | None = Field(
+        default=None, gt=0, allow_inf_nan=False, description="time a frame; None = no limit"
+    )
 
 
 class RecordingSettings(_Section):
@@ -104,6 +108,17 @@ class RecordingSettings(_Section):
     max_asset_mb: float = Field(
         default=200.0, gt=0, description="largest file that is embedded whole"
     )
+    rotate: str | None = Field(
+        default=None, description="a new file after this size or time: 100MB, 10min, or both"
+    )
+    keep: str | None = Field(
+        default=None, description="remove the oldest files beyond this size or age: 2GB, 7d"
+    )
+
+    @model_validator(mode="after")
+    def _check_files(self) -> Self:
+        check_keep(parse_rotate(self.rotate), parse_keep(self.keep))
+        return self
 
 
 class MosaicSettings(_Section):
@@ -126,9 +141,20 @@ class MosaicSettings(_Section):
 class LiveSettings(_Section):
     """Cameras and network streams."""
 
-    max_fps: float | None = Field(default=None, gt=0, allow_inf_nan=False)
-    stall_timeout_s: float = Field(default=5.0, gt=0, allow_inf_nan=False)
-    retries: int | None = Field(default=None, ge=0, description="None = for ever")
+    max_fps: float | None = Field(
+        default=None, gt=0, allow_inf_nan=False, description="pictures beyond are left out"
+    )
+    stall_timeout_s: float = Field(
+        default=5.0, gt=0, allow_inf_nan=False, description="silence after which it is reopened"
+    )
+    open_timeout_s: float = Field(
+        default=15.0, gt=0, allow_inf_nan=False, description="to the first picture of a network"
+    )
+    retries: int | None = Field(default=None, ge=0, description="in a row; None = for ever")
+    newest_only: bool = Field(
+        default=True, description="false: read every picture, however late it gets"
+    )
+    rtsp_transport: Literal["tcp", "udp"] = "tcp"
 
 
 class Settings(_Section):

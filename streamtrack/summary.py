@@ -7,6 +7,7 @@ inliers, transformation model. Definitions:
     matches        point pairs behind a track (its evidence), over all tracked target-frames
     inliers        those of them that agree with the estimate
     rmse_px        mean over the tracked frames of the inliers' RMS transfer error
+    budget         null without one; ``frames_at_level`` counts frames by level of work, full first
     losses         changes from tracking to lost
     ms_per_frame   wall time of a frame, its stages together; quantiles are nearest-rank, from
                    bins 1 % wide, so right to 0.5 %; ``by_stage`` is the mean over all frames
@@ -25,6 +26,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from streamtrack.budget import LEVELS
 from streamtrack.meters import LogHistogram, Mean, nearest_rank, peak_rss_mb
 from streamtrack.outputs import write_file
 from streamtrack.settings import Settings
@@ -125,6 +127,7 @@ class Summary:
     ms_median: float | None
     ms_p95: float | None
     ms_by_stage: dict[str, float]
+    frames_at_level: tuple[int, ...]
     time_s: float
     peak_rss_mb: float
     skipped: tuple[Skipped, ...]
@@ -173,6 +176,7 @@ class Summary:
                 "p95": self.ms_p95,
                 "by_stage": self.ms_by_stage,
             },
+            "budget": self._budget_json(),
             "fps": self.fps,
             "time_s": self.time_s,
             "peak_rss_mb": self.peak_rss_mb,
@@ -206,11 +210,27 @@ class Summary:
             ("Frames", str(self.frames)),
             *((f"Target {target.name}", target.to_text()) for target in self.targets),
             ("Tracking time a frame", ms),
+            *self._budget_rows(),
             ("Frames a second", f"{_number(self.fps, 1)}, reading and writing included"),
             ("Peak memory", f"{self.peak_rss_mb:.0f} MB"),
             ("Corrupt packets", str(self.corrupt_packets)),
             ("Skipped pictures", str(len(self.skipped))),
             ("Ended", self.ended),
+        ]
+
+    def _budget_json(self) -> dict[str, Any] | None:
+        budget_ms = self.settings.tracker.budget_ms
+        if budget_ms is None:
+            return None
+        return {"ms": budget_ms, "frames_at_level": list(self.frames_at_level)}
+
+    def _budget_rows(self) -> list[tuple[str, str]]:
+        budget_ms = self.settings.tracker.budget_ms
+        if budget_ms is None:
+            return []
+        frames = [f"level {level} {count}" for level, count in enumerate(self.frames_at_level)]
+        return [
+            ("Time budget", f"{budget_ms:g} ms; frames at each level of work: {', '.join(frames)}")
         ]
 
     def to_markdown(self) -> str:
@@ -276,6 +296,7 @@ class SummaryBuilder:
         self._features, self._inliers = Mean(), Mean()
         self._match_counts: Counter[int] = Counter()
         self._targets: dict[str, _TargetSums] = {}
+        self._frames_at_level = [0] * len(LEVELS)
         self._ms = LogHistogram()
         self._stage_ms: dict[str, float] = {}
 
@@ -287,6 +308,7 @@ class SummaryBuilder:
     def add(self, step: Step) -> None:
         """Take in one frame."""
         self._frames += 1
+        self._frames_at_level[step.work_level] += 1
         self._frames_with_pose += step.camera.world_from_frame is not None
         if step.features is not None:
             self._features.add(len(step.features))
@@ -325,6 +347,7 @@ class SummaryBuilder:
             ms_median=self._ms.quantile(0.5),
             ms_p95=self._ms.quantile(0.95),
             ms_by_stage={name: ms / self._frames for name, ms in self._stage_ms.items()},
+            frames_at_level=tuple(self._frames_at_level),
             time_s=self._clock() - self._started,
             peak_rss_mb=peak_rss_mb(),
             skipped=tuple(skipped),

@@ -43,10 +43,14 @@ from streamtrack.types import (
 _GUIDED_RADIUS_PX = 60.0
 _COAST_FRAMES = 10  # lost frames in which the last pose is still tried
 _MAX_AREA_JUMP = 1.5  # from the prediction to what is found
-_MIN_RETURN_SHARE = 0.3  # of the points in view, for a lost target found at its last place
+_MIN_RETURN_SHARE = 0.3  # of the points in view, for a target that was lost
 _FULL_SEARCH_EVERY = 12  # lost frames; between them half of the features are searched
 _FIRST_SURPRISE_PX = 5.0
-_MIN_SURPRISE_PX = 1.0
+_MIN_SURPRISE_PX = 2.0
+_THIN_SHARE = 0.33  # inliers of all points, below which hidden corners go by prediction
+_MAX_DOUBT_PX = 8.0  # how far off hidden corners may be thought to be
+_CALM_SURPRISE_PX = 2.5
+_CALM_MOTION_PX = 8.0  # a frame: less is hardly smeared
 _SURPRISE_RATE = 0.2  # share of a new frame's surprise in the running mean
 _CLEAR_VIEW_SHARE = 0.5  # inliers of all points, below which a frame teaches no surprise
 _COLOR_REACH_SHARE = 0.04  # of the target's size: how far around a point colours are compared
@@ -91,7 +95,9 @@ class HybridTracker:
         self._pose = first_pose
         self._step_pose: Matrix | None = None
         self._frames_lost = 0
+        self._searches = 0
         self._surprise_px = _FIRST_SURPRISE_PX
+        self._doubt_px = 0.0
         self._was_seen = first_pose is not None
         is_same_camera = first_pose is not None
         self._max_chroma_distance = (
@@ -102,9 +108,14 @@ class HybridTracker:
         followed = self._follow(view)
         if followed is not None and followed.registration.verdict is Verdict.OK:
             return self._tracked(followed, "flow")
+        if not self._is_searched_in(view):
+            return self._not_searched(followed)
         detected, evidence, means = self._detect(view)
         if detected.b_from_a is not None:
-            confirmed = self._with_own_colors(self._aligner.align(view, detected.b_from_a), view)
+            confirmed = self._aligner.align(view, detected.b_from_a)
+            if np.mean(confirmed.registration.is_inlier) < _MIN_RETURN_SHARE:
+                confirmed = _refused(confirmed, Verdict.LOW_CORRELATION)
+            confirmed = self._with_own_colors(confirmed, view)
             if confirmed.registration.verdict is Verdict.OK:
                 return self._tracked(confirmed, means)
             detected = confirmed.registration
@@ -112,18 +123,49 @@ class HybridTracker:
         verdict = detected if followed is None else followed.registration
         return make_track(self.template, verdict, evidence, means, self._was_seen)
 
+    def _is_searched_in(self, view: FrameView) -> bool:
+        """Lost targets take turns between their last place and a search, and keep to the budget."""
+        if self._coasts():
+            return self._frames_lost == 0
+        interval = view.work.search_interval
+        return self._frames_lost % interval == interval - 1
+
+    def _coasts(self) -> bool:
+        """Is this one of the frames in which a target is tried at its last place?"""
+        is_turn = self._frames_lost % 2 == 0
+        return self._pose is not None and is_turn and self._frames_lost <= _COAST_FRAMES
+
+    def _not_searched(self, followed: Alignment | None) -> Track:
+        self._frames_lost += 1
+        not_searched = refused(Verdict.NOT_SEARCHED, 0)
+        found = not_searched if followed is None else followed.registration
+        return make_track(self.template, found, Evidence(), "flow", self._was_seen)
+
     def _follow(self, view: FrameView) -> Alignment | None:
-        if self._pose is None or self._frames_lost > _COAST_FRAMES:
+        if self._pose is None or not self._coasts():
             return None
         guess = self._pose if self._step_pose is None else self._step_pose @ self._pose
         sigma_px = self._surprise_px if self._frames_lost == 0 else None
-        followed = self._plausible(self._aligner.align(view, guess, sigma_px), guess)
+        alignment = self._aligner.align(view, guess, sigma_px, self._is_calm(guess))
+        followed = self._plausible(alignment, guess)
         found = followed.registration
         if found.b_from_a is not None and self._frames_lost == 0:
             share = np.count_nonzero(found.is_inlier) / len(followed.is_in_view)
             if share >= _CLEAR_VIEW_SHARE:
                 self._learn_surprise(guess, found.b_from_a)
+                self._doubt_px = 0.0
+            elif share < _THIN_SHARE:
+                self._doubt_px = float(np.hypot(self._doubt_px, self._surprise_px))
+                if self._doubt_px > _MAX_DOUBT_PX:
+                    followed = _refused(followed, Verdict.MOSTLY_HIDDEN)
         return followed if self._frames_lost == 0 else self._with_own_colors(followed, view)
+
+    def _is_calm(self, guess: Matrix) -> bool:
+        """Is the target's motion, by the last frames, slow and well predicted?"""
+        if self._pose is None or self._frames_lost or self._surprise_px > _CALM_SURPRISE_PX:
+            return False
+        moved_px = _rms_distance_px(guess, self._pose, self.template.quad)
+        return moved_px <= _CALM_MOTION_PX
 
     def _plausible(self, alignment: Alignment, guess: Matrix) -> Alignment:
         """The alignment, refused if the target jumped in size, or came back on thin evidence."""
@@ -143,9 +185,7 @@ class HybridTracker:
 
     def _learn_surprise(self, expected: Matrix, found: Matrix) -> None:
         """How far the corners are from their prediction, averaged over the last frames."""
-        quad = self.template.quad
-        apart = geometry.transform_points(expected, quad) - geometry.transform_points(found, quad)
-        surprise_px = float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+        surprise_px = _rms_distance_px(expected, found, self.template.quad)
         self._surprise_px += _SURPRISE_RATE * (surprise_px - self._surprise_px)
         self._surprise_px = max(self._surprise_px, _MIN_SURPRISE_PX)
 
@@ -185,7 +225,8 @@ class HybridTracker:
             if found.verdict is Verdict.OK:
                 return found, evidence, "guided"
         sees_all = not self._was_seen or self._frames_lost % _FULL_SEARCH_EVERY == 1
-        features = view.features() if sees_all else view.half_of_features(self._frames_lost)
+        self._searches += 1
+        features = view.features() if sees_all else view.half_of_features(self._searches)
         matches = match(self.template.features, features, self._settings.matching)
         found, evidence = _register_features(self.template, view, features, matches, self._settings)
         return found, evidence, "global"
@@ -199,6 +240,9 @@ class HybridTracker:
             self._step_pose = _shared_motion(model, self.template.quad, self._pose, found.b_from_a)
         else:
             self._step_pose = None
+            self._doubt_px = 0.0
+            share = float(np.mean(found.is_inlier))
+            self._surprise_px = max(self._surprise_px, _FIRST_SURPRISE_PX / max(share, 0.1))
         self._pose = found.b_from_a
         self._frames_lost = 0
         self._was_seen = True
@@ -206,6 +250,12 @@ class HybridTracker:
         return make_track(
             self.template, found, evidence, means, self._was_seen, alignment.correlation
         )
+
+
+def _rms_distance_px(one: Matrix, other: Matrix, quad: Points) -> float:
+    """How far apart two poses put the quad's corners (4, 2), in frame pixels."""
+    apart = geometry.transform_points(one, quad) - geometry.transform_points(other, quad)
+    return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
 
 
 def _refused(alignment: Alignment, verdict: Verdict) -> Alignment:

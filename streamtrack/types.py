@@ -59,6 +59,10 @@ class Frame:
     ``index`` counts the source's pictures from 0, those that were left out included.
     ``name`` is the file name for pictures and empty for video. ``packets`` are the encoded
     packets that arrived since the frame before, if the source was opened to deliver them.
+
+    Live sources tell when the picture was captured: ``captured_s`` on `time.monotonic`'s clock and
+    ``captured_unix_s`` as wall time. ``epoch`` counts how often the stream began anew: with it the
+    view, the size and the colours may be others.
     """
 
     index: int
@@ -66,6 +70,9 @@ class Frame:
     image: Image
     name: str = ""
     packets: tuple[Packet, ...] = ()
+    captured_s: float | None = None
+    captured_unix_s: float | None = None
+    epoch: int = 0
 
     def __post_init__(self) -> None:
         if self.image.dtype != np.uint8 or not (
@@ -186,7 +193,12 @@ class Verdict(StrEnum):
     PERSPECTIVE = "perspective beyond belief"
     LOW_CORRELATION = "picture does not correlate with the target"
     OTHER_COLORS = "colours differ from the target's"
+    MOSTLY_HIDDEN = "too little of the target in view to place its corners"
+    NOT_SEARCHED = "not searched for in this frame, to keep to the time budget"
     OUT_OF_VIEW = "target out of view"
+    UNCERTAIN = "corners too uncertain"
+    AMBIGUOUS = "repeated texture, another place fits as well"
+    STRETCHED = "frame would cover more than four times its area"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -287,13 +299,21 @@ class Track:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPose:
-    """Where the camera looks: ``world_from_frame`` is None if unknown, with the reason."""
+    """Where the camera looks: ``world_from_frame`` is None if unknown, with the reason.
+
+    ``matches`` and ``inliers`` count the places that were compared and that agree. ``keyframe`` is
+    the index of the keyframe that the frame was measured against, the frame's own if it became
+    one. ``warning`` says what is wrong although the pose is given: a fixed camera that was moved.
+    """
 
     world_from_frame: Matrix | None
     matches: int = 0
     inliers: int = 0
     rmse_px: float = float("nan")
     reason: str = ""
+    keyframe: int | None = None
+    is_keyframe: bool = False
+    warning: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -302,7 +322,7 @@ class Step:
 
     ``features`` are the frame's own keypoints if any were detected in it (following a target
     by flow needs none). ``stage_ms`` maps the stages that ran to wall milliseconds, ``total``
-    among them.
+    among them. ``work_level`` says by how many steps (`streamtrack.budget`) work was lowered.
     """
 
     frame: Frame
@@ -310,3 +330,4 @@ class Step:
     camera: CameraPose
     features: Features | None
     stage_ms: dict[str, float]
+    work_level: int = 0

@@ -40,6 +40,14 @@ def track(
         str | None,
         typer.Option(help="hybrid (predict, warp back, flow) or detect (every frame by itself)."),
     ] = None,
+    budget: Annotated[
+        float | None,
+        typer.Option(
+            metavar="MS",
+            help="Keep the tracking time a frame near MS by doing less, in four stated levels. "
+            "Results then depend on the machine's speed.",
+        ),
+    ] = None,
     camera: Annotated[str | None, typer.Option(help="fixed or moving.")] = None,
     detector: Annotated[str | None, typer.Option(help=f"{DETECTORS}.")] = None,
     threshold: Annotated[float | None, typer.Option(help="The detector's own threshold.")] = None,
@@ -78,7 +86,7 @@ def track(
         {
             "features": {"detector": detector, "threshold": threshold, "descriptor": descriptor},
             "registration": {"model": model},
-            "tracker": {"method": method},
+            "tracker": {"method": method, "budget_ms": budget},
             "camera": camera,
             "recording": {"video": record_video},
         },

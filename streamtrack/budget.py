@@ -1,0 +1,73 @@
+"""Keeping to a time a frame by doing less, in stated steps.
+
+Each level halves the area that is aligned and the features that are looked for; the lowest also
+search for lost targets only now and then. The level goes down when frames take longer than the
+budget and up again when there is room, so with a budget results depend on the machine's speed;
+without one they never do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class WorkLevel:
+    """How much is done for a frame.
+
+    patch_steps      steps of `2**-0.5` in scale by which targets are aligned more coarsely
+    feature_share    of the features that the settings ask for
+    search_interval  lost targets are searched for in every so many-th frame
+    """
+
+    index: int
+    patch_steps: int
+    feature_share: float
+    search_interval: int
+
+
+LEVELS = (
+    WorkLevel(0, 0, 1.0, 1),
+    WorkLevel(1, 1, 0.5, 1),
+    WorkLevel(2, 2, 0.35, 2),
+    WorkLevel(3, 3, 0.25, 4),
+)
+FULL_WORK = LEVELS[0]
+
+_RATE = 0.25  # share of a new frame in the running mean
+_ROOM_SHARE = 0.55  # of the budget: a level costs at most about 1 / 0.6 of the next lower one
+_FRAMES_BEFORE_LESS = 3
+_FRAMES_BEFORE_MORE = 30
+
+
+class Budget:
+    """Chooses the level of each frame from what the frames before took."""
+
+    def __init__(self, budget_ms: float | None) -> None:
+        self._budget_ms = budget_ms
+        self._level = 0
+        self._mean_ms: float | None = None
+        self._frames_at_level = 0
+
+    @property
+    def level(self) -> WorkLevel:
+        return LEVELS[self._level]
+
+    def note(self, frame_ms: float) -> None:
+        """Take in what a frame took at the present level."""
+        if self._budget_ms is None:
+            return
+        mean = frame_ms if self._mean_ms is None else self._mean_ms
+        self._mean_ms = mean + _RATE * (frame_ms - mean)
+        self._frames_at_level += 1
+        if self._mean_ms > self._budget_ms and self._frames_at_level >= _FRAMES_BEFORE_LESS:
+            self._go_to(min(self._level + 1, len(LEVELS) - 1))
+        elif (
+            self._mean_ms < _ROOM_SHARE * self._budget_ms
+            and self._frames_at_level >= _FRAMES_BEFORE_MORE
+        ):
+            self._go_to(max(self._level - 1, 0))
+
+    def _go_to(self, level: int) -> None:
+        if level != self._level:
+            self._level, self._mean_ms, self._frames_at_level = level, None, 0

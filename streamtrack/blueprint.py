@@ -4,7 +4,12 @@ Entities:
     camera/image, camera/keypoints, camera/matches       the picture and what was found in it
     camera/targets/<name>/quad, /corners                 where each target is
     targets/<name>/state, /template, /view               its state, how it was given, as seen now
+    mosaic/image, mosaic/frame                           the mosaic so far, where the frame lies
+    mosaic/keyframes, mosaic/links, mosaic/loops         its keyframes and what joins them
+    mosaic/targets/<name>/path, /position                where each target went on the mosaic
+    mosaic/state, source/state                           states of the mosaic, of a live source
     metrics/features, metrics/<name>/..., metrics/ms/... curves
+    metrics/mosaic/..., metrics/age_ms, metrics/source/...
     summary, log                                         text
 """
 
@@ -27,6 +32,17 @@ KEYPOINTS = "camera/keypoints"
 MATCHES = "camera/matches"
 FEATURE_COUNT = "metrics/features"
 TOTAL_MS = "metrics/ms"
+AGE_MS = "metrics/age_ms"
+SOURCE_STATE = "source/state"
+SOURCE_COUNTS = "metrics/source"
+MOSAIC = "mosaic"
+MOSAIC_IMAGE = "mosaic/image"
+MOSAIC_FRAME = "mosaic/frame"
+MOSAIC_KEYFRAMES = "mosaic/keyframes"
+MOSAIC_LINKS = "mosaic/links"
+MOSAIC_LOOPS = "mosaic/loops"
+MOSAIC_STATE = "mosaic/state"
+MOSAIC_CURVES = "metrics/mosaic"
 SUMMARY = "summary"
 LOG = "log"
 
@@ -36,13 +52,24 @@ Rgb = tuple[int, int, int]
 _GREEN: Rgb = (70, 225, 110)
 _RED: Rgb = (255, 75, 75)
 _GREY: Rgb = (175, 180, 195)
-_BLUE: Rgb = (80, 160, 255)
-_ORANGE: Rgb = (255, 160, 40)
+BLUE: Rgb = (80, 160, 255)
+ORANGE: Rgb = (255, 160, 40)
 _VIOLET: Rgb = (190, 130, 255)
-_STATE_COLORS: dict[TrackState, Rgb] = {
-    TrackState.SEARCHING: (66, 140, 230),
-    TrackState.TRACKING: (64, 160, 80),
-    TrackState.LOST: (214, 72, 66),
+LANE_BLUE: Rgb = (66, 140, 230)
+LANE_GREEN: Rgb = (64, 160, 80)
+LANE_RED: Rgb = (214, 72, 66)
+LANE_YELLOW: Rgb = (205, 150, 40)
+_STATE_COLORS: dict[str, Rgb] = {
+    TrackState.SEARCHING: LANE_BLUE,
+    TrackState.TRACKING: LANE_GREEN,
+    TrackState.LOST: LANE_RED,
+}
+_SOURCE_COLORS: dict[str, Rgb] = {
+    "connecting": LANE_BLUE,
+    "streaming": LANE_GREEN,
+    "stalled": LANE_YELLOW,
+    "waiting": LANE_RED,
+    "ended": (110, 115, 125),
 }
 _TARGET_COLORS: tuple[Rgb, ...] = (
     (255, 205, 0),
@@ -52,7 +79,7 @@ _TARGET_COLORS: tuple[Rgb, ...] = (
     (170, 255, 90),
     (190, 150, 255),
 )
-_STAGE_COLORS: tuple[Rgb, ...] = (_BLUE, _GREEN, _ORANGE, (240, 100, 160), (0, 200, 200), _GREY)
+_STAGE_COLORS: tuple[Rgb, ...] = (BLUE, _GREEN, ORANGE, (240, 100, 160), (0, 200, 200), _GREY)
 _MAX_SIDE_BY_SIDE = 3
 
 
@@ -70,6 +97,8 @@ class TargetEntities:
     inliers: str
     rmse_px: str
     correlation: str
+    mosaic_path: str
+    mosaic_position: str
 
     @classmethod
     def of(cls, name: str) -> TargetEntities:
@@ -87,10 +116,12 @@ class TargetEntities:
             inliers=path("metrics", name, "inliers"),
             rmse_px=path("metrics", name, "rmse_px"),
             correlation=path("metrics", name, "correlation"),
+            mosaic_path=path("mosaic", "targets", name, "path"),
+            mosaic_position=path("mosaic", "targets", name, "position"),
         )
 
 
-def _ui_points(radius: float) -> list[float]:
+def ui_points(radius: float) -> list[float]:
     """A radius on the screen, whatever the zoom; Rerun encodes it as a negative number."""
     return [-radius]
 
@@ -100,27 +131,28 @@ def target_color(number: int) -> Rgb:
     return _TARGET_COLORS[number % len(_TARGET_COLORS)]
 
 
+def point_classes() -> rr.AnnotationContext:
+    """The colours of points and lines by what became of them."""
+    return rr.AnnotationContext(
+        [
+            rr.AnnotationInfo(INLIER, "inlier", _GREEN),
+            rr.AnnotationInfo(OUTLIER, "outlier", _RED),
+            rr.AnnotationInfo(UNMATCHED, "unmatched", _GREY),
+        ]
+    )
+
+
 def log_styles(stream: rr.RecordingStream) -> None:
     """Log once how the entities that every recording has are drawn."""
-    stream.log(
-        "camera",
-        rr.AnnotationContext(
-            [
-                rr.AnnotationInfo(INLIER, "inlier", _GREEN),
-                rr.AnnotationInfo(OUTLIER, "outlier", _RED),
-                rr.AnnotationInfo(UNMATCHED, "unmatched", _GREY),
-            ]
-        ),
-        static=True,
-    )
+    stream.log("camera", point_classes(), static=True)
     stream.log(
         KEYPOINTS,
-        rr.Points2D.from_fields(radii=_ui_points(1.8), show_labels=False, draw_order=20),
+        rr.Points2D.from_fields(radii=ui_points(1.8), show_labels=False, draw_order=20),
         static=True,
     )
     stream.log(
         MATCHES,
-        rr.LineStrips2D.from_fields(radii=_ui_points(0.7), show_labels=False, draw_order=10),
+        rr.LineStrips2D.from_fields(radii=ui_points(0.7), show_labels=False, draw_order=10),
         static=True,
     )
     log_curve_style(stream, FEATURE_COUNT, "features", _GREY)
@@ -136,7 +168,7 @@ def log_target_styles(
         entities.quad,
         rr.LineStrips2D.from_fields(
             colors=[color],
-            radii=_ui_points(2.0),
+            radii=ui_points(2.0),
             labels=[name],
             show_labels=True,
             draw_order=30,
@@ -147,32 +179,43 @@ def log_target_styles(
         entities.corners,
         rr.Points2D.from_fields(
             colors=[(255, 255, 255), color, color, color],  # white marks its top left
-            radii=_ui_points(4.0),
+            radii=ui_points(4.0),
             show_labels=False,
             draw_order=31,
         ),
         static=True,
     )
+    log_lane_style(stream, entities.state, _STATE_COLORS)
+    is_alone = count == 1
+    prefix = "" if is_alone else f"{name} "
+    faint: Rgb = (color[0] * 5 // 9, color[1] * 5 // 9, color[2] * 5 // 9)
+    log_curve_style(stream, entities.matches, f"{prefix}matches", BLUE if is_alone else faint)
+    log_curve_style(stream, entities.inliers, f"{prefix}inliers", _GREEN if is_alone else color)
+    log_curve_style(stream, entities.rmse_px, f"{prefix}RMSE", ORANGE if is_alone else color)
+    log_curve_style(
+        stream, entities.correlation, f"{prefix}correlation", _VIOLET if is_alone else color
+    )
+
+
+def log_source_styles(stream: rr.RecordingStream) -> None:
+    """Log once how the state of a live source and the age of its frames are drawn."""
+    log_lane_style(stream, SOURCE_STATE, _SOURCE_COLORS)
+    log_curve_style(stream, AGE_MS, "age in ms", _VIOLET)
+
+
+def log_lane_style(stream: rr.RecordingStream, path: str, colors: dict[str, Rgb]) -> None:
+    """Log once the colours of the states of one lane."""
     stream.log(
-        entities.state,
+        path,
         rr.StateConfiguration(
-            values=[str(state) for state in _STATE_COLORS],
-            labels=[str(state) for state in _STATE_COLORS],
+            values=[str(state) for state in colors],
+            labels=[str(state) for state in colors],
             colors=np.array(
-                [(r << 24) | (g << 16) | (b << 8) | 0xFF for r, g, b in _STATE_COLORS.values()],
+                [(r << 24) | (g << 16) | (b << 8) | 0xFF for r, g, b in colors.values()],
                 np.uint32,
             ),
         ),
         static=True,
-    )
-    is_alone = count == 1
-    prefix = "" if is_alone else f"{name} "
-    faint: Rgb = (color[0] * 5 // 9, color[1] * 5 // 9, color[2] * 5 // 9)
-    log_curve_style(stream, entities.matches, f"{prefix}matches", _BLUE if is_alone else faint)
-    log_curve_style(stream, entities.inliers, f"{prefix}inliers", _GREEN if is_alone else color)
-    log_curve_style(stream, entities.rmse_px, f"{prefix}RMSE", _ORANGE if is_alone else color)
-    log_curve_style(
-        stream, entities.correlation, f"{prefix}correlation", _VIOLET if is_alone else color
     )
 
 
@@ -187,15 +230,68 @@ def log_curve_style(
     stream.log(path, rr.SeriesLines(colors=[color], names=[name], widths=[width]), static=True)
 
 
-def build(size_wh: Size, target_names: Sequence[str], timeline: str) -> rrb.Blueprint:
-    """The layout for a screen of about 1920x1080: picture and targets above, curves below."""
+def build(
+    size_wh: Size,
+    target_names: Sequence[str],
+    timeline: str,
+    has_mosaic: bool = False,
+    is_live: bool = False,
+    is_following: bool = False,
+) -> rrb.Blueprint:
+    """The layout for a screen of about 1920x1080: picture and targets above, curves below.
+
+    A mosaic stands beside the picture; a live source has a lane and curves of its own.
+    ``is_following`` keeps to the newest data, as a live view should.
+    """
     targets = [(name, TargetEntities.of(name)) for name in target_names]
+    states = [entities.state for _, entities in targets]
+    states += [MOSAIC_STATE] if has_mosaic else []
+    states += [SOURCE_STATE] if is_live else []
     lanes = rrb.StateTimelineView(
         name="State",
-        origin="/targets",
-        contents=[entities.state for _, entities in targets] or "/targets/**",
+        origin="/",
+        contents=[f"/{path.lstrip('/')}" for path in states] or "/targets/**",
     )
-    text = rrb.Tabs(
+    rows_of_targets = len(targets) if len(targets) <= _MAX_SIDE_BY_SIDE else 1
+    side = rrb.Vertical(
+        *_close_ups(targets),
+        text_tabs(timeline),
+        row_shares=[1.0 + rows_of_targets, 3.0] if targets else [1.0],
+    )
+    pictures: list[Any] = [_camera_view(size_wh), *([_mosaic_view()] if has_mosaic else []), side]
+    shares = [4.0, 3.6, 2.4] if has_mosaic else [5.0, 3.0]
+    return whole_layout(
+        rrb.Vertical(
+            rrb.Horizontal(*pictures, column_shares=shares),
+            _curves(targets, has_mosaic, is_live),
+            lanes,
+            row_shares=[6.0, 2.6, 0.75 + 0.42 * min(len(states), 6)],
+        ),
+        timeline,
+        is_following,
+    )
+
+
+def whole_layout(root: Any, timeline: str, is_following: bool = False) -> rrb.Blueprint:
+    """The panels about ``root`` closed, nothing added by itself."""
+    return rrb.Blueprint(
+        root,
+        rrb.TimePanel(
+            state="collapsed",
+            timeline=timeline,
+            play_state="following" if is_following else None,
+            loop_mode="off" if is_following else "all",
+        ),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def text_tabs(timeline: str) -> rrb.Tabs:
+    """The log, and before it the summary."""
+    return rrb.Tabs(
         rrb.TextLogView(
             name="Log",
             origin=f"/{LOG}",
@@ -206,22 +302,11 @@ def build(size_wh: Size, target_names: Sequence[str], timeline: str) -> rrb.Blue
         rrb.TextDocumentView(name="Summary", origin=f"/{SUMMARY}"),
         active_tab=1,
     )
-    rows_of_targets = len(targets) if len(targets) <= _MAX_SIDE_BY_SIDE else 1
-    side = rrb.Vertical(
-        *_close_ups(targets), text, row_shares=[1.0 + rows_of_targets, 3.0] if targets else [1.0]
-    )
-    return rrb.Blueprint(
-        rrb.Vertical(
-            rrb.Horizontal(_camera_view(size_wh), side, column_shares=[5.0, 3.0]),
-            _curves(targets),
-            lanes,
-            row_shares=[6.0, 2.6, 0.75 + 0.42 * min(len(targets), 6)],
-        ),
-        rrb.TimePanel(state="collapsed", timeline=timeline, loop_mode="all"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.BlueprintPanel(state="collapsed"),
-        auto_views=False,
-        auto_layout=False,
+
+
+def _mosaic_view() -> rrb.Spatial2DView:
+    return rrb.Spatial2DView(
+        name="Mosaic", origin=f"/{MOSAIC}", contents=[f"/{MOSAIC}/**", f"- /{MOSAIC_STATE}"]
     )
 
 
@@ -253,14 +338,22 @@ def _close_ups(targets: Sequence[tuple[str, TargetEntities]]) -> list[Any]:
     return [rrb.Tabs(*pairs, active_tab=0)]
 
 
-def _curves(targets: Sequence[tuple[str, TargetEntities]]) -> rrb.Horizontal | rrb.Tabs:
+def _curves(
+    targets: Sequence[tuple[str, TargetEntities]], has_mosaic: bool, is_live: bool
+) -> rrb.Horizontal | rrb.Tabs:
+    more: list[Any] = [_curve("Mosaic", [f"{MOSAIC_CURVES}/**"])] if has_mosaic else []
+    if is_live:
+        age = _curve("Age of the frame in ms", [AGE_MS])
+        more.append(rrb.Tabs(age, _curve("Frames not seen", [f"{SOURCE_COUNTS}/**"]), active_tab=0))
     if len(targets) <= _MAX_SIDE_BY_SIDE:
-        return _curve_row([entities for _, entities in targets])
-    rows = [_curve_row([entities], name) for name, entities in targets]
+        return _curve_row([entities for _, entities in targets], more)
+    rows = [_curve_row([entities], more, name) for name, entities in targets]
     return rrb.Tabs(*rows, active_tab=0)
 
 
-def _curve_row(targets: Sequence[TargetEntities], name: str | None = None) -> rrb.Horizontal:
+def _curve_row(
+    targets: Sequence[TargetEntities], more: Sequence[Any], name: str | None = None
+) -> rrb.Horizontal:
     counts = [path for target in targets for path in (target.matches, target.inliers)]
     agreement = rrb.Tabs(
         _curve("RMSE in px", [target.rmse_px for target in targets]),
@@ -269,8 +362,9 @@ def _curve_row(targets: Sequence[TargetEntities], name: str | None = None) -> rr
     )
     return rrb.Horizontal(
         _curve("Features, matches, inliers", [FEATURE_COUNT, *counts]),
-        agreement,
+        *([agreement] if targets else []),
         _curve("Milliseconds a frame", [f"{TOTAL_MS}/**"]),
+        *more,
         name=name,
     )
 

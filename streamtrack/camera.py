@@ -1,29 +1,49 @@
 """Camera motion: where each frame lies in the world, the pixel frame of the first keyframe.
 
-A moving camera is registered against a keyframe, not against the frame before: consecutive
-frames differ too little, and their errors would add up. A new keyframe is taken when the view
-has moved on, always from a frame whose own pose passed the gate.
+A moving camera is aligned with a keyframe, not with the frame before: consecutive frames differ
+too little, and their errors would add up. A new keyframe is taken when the view has moved on,
+always from a sharp frame whose own pose passed the gate. What does not pass changes nothing: the
+pose is unknown until a later frame is recognised, near where the camera was or by the features of
+any keyframe.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
-import cv2
 import numpy as np
 
 from streamtrack import geometry
+from streamtrack.fitting import fit
 from streamtrack.frame_view import FrameView
-from streamtrack.matching import match
-from streamtrack.registration import register
+from streamtrack.keyframes import KeyframeGraph
+from streamtrack.loops import LevelCache, LoopCloser, NewKeyframe, link_of, overlapping
+from streamtrack.mosaic.types import Link
+from streamtrack.relocalising import Relocaliser
 from streamtrack.settings import Settings
-from streamtrack.types import CameraPose, Features, Matrix, Registration, Track, Verdict
+from streamtrack.types import CameraPose, Matrix, Model, Points, Size, Track, Verdict
+from streamtrack.view_alignment import (
+    ReferenceView,
+    ViewAlignment,
+    ViewLevels,
+    align,
+    align_exactly,
+)
 
 _MIN_OVERLAP = 0.6
-_MIN_KEYFRAME_INLIERS = 60
-_KEYFRAMES_KEPT = 4
+_MIN_OVERLAP_UNSHARP = 0.45  # below which a blurred frame, too, becomes a keyframe
+_MIN_SHARPNESS = 0.75
+_MIN_AGREEING_CELLS = 30
+_MIN_LASTING_SHARE = 0.5  # of agreeing cells; below it the scene itself has changed
+_MIN_SPACING = 3  # frames between keyframes that are taken for that alone
+_MIN_REUSED_OVERLAP = 0.8
+_MIN_TEXTURED_CELLS = 12
+_MAX_AREA_JUMP = 1.5
+_MAX_STRETCH = 4.0
+_MAX_STEPS_AHEAD = 8
+_REFERENCES_KEPT = 6
 
 
 class CameraEstimator(Protocol):
@@ -34,9 +54,14 @@ class CameraEstimator(Protocol):
         ...
 
 
-def make_camera(settings: Settings) -> CameraEstimator:
-    """The camera model that the settings ask for."""
-    return MovingCamera(settings) if settings.camera == "moving" else FixedCamera()
+def make_camera(settings: Settings, *, is_live: bool = False) -> CameraEstimator:
+    """The camera model that the settings ask for.
+
+    ``is_live`` closes loops in a thread of its own, so that no frame waits for it.
+    """
+    if settings.camera == "moving":
+        return MovingCamera(settings, is_threaded=is_live)
+    return FixedCamera()
 
 
 class FixedCamera:
@@ -47,74 +72,263 @@ class FixedCamera:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Keyframe:
-    background: Features
-    world_from_keyframe: Matrix
+class _State:
+    """Where the camera was last known to be.
+
+    ``step`` is the motion (last frame from next, a similarity) in ``step_s`` seconds, None if it
+    is not known.
+    """
+
+    keyframe: int
+    keyframe_from_frame: Matrix
+    time_s: float
+    step: Matrix | None
+    step_s: float
+
+    def predicted(self, time_s: float) -> Matrix:
+        """keyframe_from_frame at a time, if the camera goes on as it went."""
+        if self.step is None:
+            return self.keyframe_from_frame
+        steps = (time_s - self.time_s) / self.step_s if self.step_s > 0 else 1.0
+        count = min(_MAX_STEPS_AHEAD, max(0, round(steps)))
+        ahead = np.linalg.matrix_power(self.step, count)
+        return geometry.normalized(self.keyframe_from_frame @ ahead)
 
 
 class MovingCamera:
-    """A camera that moves: the background's features against those of the last keyframes."""
+    """A camera that moves over a scene that is flat, or far, or seen from one place.
 
-    def __init__(self, settings: Settings) -> None:
-        self._settings = settings
-        self._keyframes: list[_Keyframe] = []
+    ``graph`` holds the keyframes; its poses may still change until `close`.
+    """
+
+    def __init__(self, settings: Settings, *, is_threaded: bool = False) -> None:
+        self.graph = KeyframeGraph()
+        self._levels = LevelCache(self.graph)
+        self._loops = LoopCloser(self.graph, self._levels, is_threaded)
+        self._relocaliser = Relocaliser(self.graph, settings)
+        self._references: dict[int, ReferenceView] = {}
+        self._state: _State | None = None
 
     def update(self, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
-        background = _outside_targets(view.features(), tracks)
-        if not self._keyframes:
-            return self._first_pose(background)
-        pose = CameraPose(None, reason=Verdict.TOO_FEW_MATCHES)
-        for keyframe in reversed(self._keyframes):
-            pose, keyframe_from_frame = self._pose_against(keyframe, background, view)
-            if pose.world_from_frame is not None and keyframe_from_frame is not None:
-                if _has_moved_on(keyframe_from_frame, pose, view):
-                    self._add_keyframe(background, pose.world_from_frame)
-                break
-        return pose
-
-    def _first_pose(self, background: Features) -> CameraPose:
-        if len(background) < self._settings.registration.min_inliers:
+        """The camera's pose in the next frame; targets' quads are left out of account."""
+        levels = ViewLevels(view.grey)
+        hidden = [track.quad for track in tracks if track.quad is not None]
+        state = self._state
+        if state is None:
+            return self._begin(view, levels, hidden)
+        if levels.is_flat():
             return CameraPose(None, reason=Verdict.TOO_FEW_FEATURES)
-        self._add_keyframe(background, np.eye(3))
-        return CameraPose(np.eye(3), len(background), len(background), 0.0)
+        found = self._follow(state, view, levels, hidden)
+        keyframe = state.keyframe
+        if found.reference_from_view is None:
+            recognised = self._recognise(state, levels, hidden)
+            if recognised is None:
+                return _refused(found)
+            keyframe, found = recognised
+        self._relocaliser.rest()
+        return self._placed(view, levels, hidden, keyframe, found)
 
-    def _add_keyframe(self, background: Features, world_from_frame: Matrix) -> None:
-        self._keyframes.append(_Keyframe(background, world_from_frame))
-        del self._keyframes[:-_KEYFRAMES_KEPT]
+    def close(self) -> None:
+        """Finish the work on loops: the graph's poses are final then."""
+        self._loops.close()
 
-    def _pose_against(
-        self, keyframe: _Keyframe, background: Features, view: FrameView
-    ) -> tuple[CameraPose, Matrix | None]:
-        matches = match(background, keyframe.background, self._settings.matching)
-        width, height = view.size_wh
-        found: Registration = register(
-            background.points[matches.ref],
-            keyframe.background.points[matches.cur],
-            self._settings.registration,
-            geometry.image_quad(view.size_wh),
-            float(width * height),
+    def _begin(self, view: FrameView, levels: ViewLevels, hidden: Sequence[Points]) -> CameraPose:
+        reference = ReferenceView(levels, hidden)
+        cells = reference.textured_cells
+        if cells < _MIN_TEXTURED_CELLS:
+            return CameraPose(None, reason=Verdict.TOO_FEW_FEATURES)
+        self._take(view, reference, np.eye(3), None)
+        self._state = _State(view.frame.index, np.eye(3), view.frame.time_s, None, 0.0)
+        return CameraPose(np.eye(3), cells, cells, 0.0, keyframe=view.frame.index, is_keyframe=True)
+
+    def _follow(
+        self, state: _State, view: FrameView, levels: ViewLevels, hidden: Sequence[Points]
+    ) -> ViewAlignment:
+        """The frame against the keyframe of the frame before, where the motion leads or leaves."""
+        reference = self._reference(state.keyframe)
+        guess = state.predicted(view.frame.time_s)
+        found = _without_jump(align(reference, levels, guess, hidden), guess, view.size_wh)
+        if found.reference_from_view is not None:
+            return found
+        guess = state.keyframe_from_frame
+        searched = align(reference, levels, guess, hidden, is_searched=True)
+        searched = _without_jump(searched, guess, view.size_wh)
+        return found if searched.reference_from_view is None else searched
+
+    def _recognise(
+        self, state: _State, levels: ViewLevels, hidden: Sequence[Points]
+    ) -> tuple[int, ViewAlignment] | None:
+        """The keyframe that a frame shows by its features, and the alignment that confirms it."""
+        for keyframe, guess in self._relocaliser.candidates(state.keyframe, levels):
+            found = align(self._reference(keyframe), levels, guess, hidden)
+            if found.reference_from_view is not None:
+                return keyframe, found
+        return None
+
+    def _placed(
+        self,
+        view: FrameView,
+        levels: ViewLevels,
+        hidden: Sequence[Points],
+        keyframe: int,
+        found: ViewAlignment,
+    ) -> CameraPose:
+        """The pose of an accepted frame; goes over to another keyframe where that is better."""
+        keyframe_from_frame = found.reference_from_view
+        assert keyframe_from_frame is not None
+        index, matches = view.frame.index, len(found.is_inlier)
+        world_from_keyframe = self.graph.keyframes[keyframe].world_from_keyframe
+        world_from_frame = geometry.normalized(world_from_keyframe @ keyframe_from_frame)
+        self._remember(view, keyframe, keyframe_from_frame)
+        if _stretch(world_from_frame, view.size_wh) > _MAX_STRETCH:
+            return CameraPose(None, matches, found.inliers, found.rmse_px, Verdict.STRETCHED)
+        self.graph.add_frame(index, keyframe, keyframe_from_frame)
+        is_keyframe = False
+        if self._has_moved_on(found, view, keyframe):
+            other = self._better_keyframe(view, levels, hidden, keyframe, world_from_frame)
+            if other is not None:
+                keyframe = other
+            elif self._extend(view, levels, hidden, keyframe, found):
+                keyframe, is_keyframe = index, True
+            moved = self.graph.world_from_frame(index)
+            world_from_frame = world_from_frame if moved is None else moved
+        return CameraPose(
+            world_from_frame,
+            matches,
+            found.inliers,
+            found.rmse_px,
+            keyframe=keyframe,
+            is_keyframe=is_keyframe,
         )
-        world_from_frame = None
-        if found.b_from_a is not None:
-            world_from_frame = geometry.normalized(keyframe.world_from_keyframe @ found.b_from_a)
-        reason = "" if world_from_frame is not None else str(found.verdict)
-        pose = CameraPose(world_from_frame, len(matches), found.inliers, found.rmse_px, reason)
-        return pose, found.b_from_a
+
+    def _remember(self, view: FrameView, keyframe: int, keyframe_from_frame: Matrix) -> None:
+        state, time_s = self._state, view.frame.time_s
+        step, step_s = None, 0.0
+        if state is not None and state.keyframe == keyframe and time_s > state.time_s:
+            motion = geometry.inverted(state.keyframe_from_frame) @ keyframe_from_frame
+            quad = geometry.image_quad(view.size_wh)
+            step = fit(Model.SIMILARITY, quad, geometry.transform_points(motion, quad))
+            step_s = time_s - state.time_s
+        self._state = _State(keyframe, keyframe_from_frame, time_s, step, step_s)
+
+    def _go_over(self, keyframe: int, keyframe_from_frame: Matrix) -> None:
+        """Go on from another keyframe; the motion from frame to frame stays."""
+        state = self._state
+        assert state is not None
+        self._state = _State(keyframe, keyframe_from_frame, state.time_s, state.step, state.step_s)
+
+    def _has_moved_on(self, found: ViewAlignment, view: FrameView, keyframe: int) -> bool:
+        if _overlap(found, view.size_wh) < _MIN_OVERLAP or found.inliers < _MIN_AGREEING_CELLS:
+            return True
+        has_changed = found.inliers < _MIN_LASTING_SHARE * len(found.is_inlier)
+        return has_changed and view.frame.index >= keyframe + _MIN_SPACING
+
+    def _may_be_keyframe(self, found: ViewAlignment, size_wh: Size) -> bool:
+        is_late = _overlap(found, size_wh) < _MIN_OVERLAP_UNSHARP
+        return found.sharpness >= _MIN_SHARPNESS or is_late
+
+    def _better_keyframe(
+        self,
+        view: FrameView,
+        levels: ViewLevels,
+        hidden: Sequence[Points],
+        keyframe: int,
+        world_from_frame: Matrix,
+    ) -> int | None:
+        """A keyframe taken earlier that sees nearly all of the frame, and agrees with it."""
+        shares = overlapping(self.graph, world_from_frame, view.size_wh, _MIN_REUSED_OVERLAP)
+        for _, other in shares[:1]:
+            if other == keyframe:
+                continue
+            pose = self.graph.keyframes[other].world_from_keyframe
+            guess = geometry.normalized(geometry.inverted(pose) @ world_from_frame)
+            found = align(self._reference(other), levels, guess, hidden)
+            if found.reference_from_view is not None:
+                self._go_over(other, found.reference_from_view)
+                return other
+        return None
+
+    def _extend(
+        self,
+        view: FrameView,
+        levels: ViewLevels,
+        hidden: Sequence[Points],
+        keyframe: int,
+        found: ViewAlignment,
+    ) -> bool:
+        """Take the frame as a keyframe if it is sharp and stands the exact alignment, too."""
+        if not self._may_be_keyframe(found, view.size_wh):
+            return False
+        assert found.reference_from_view is not None
+        index = view.frame.index
+        reference = ReferenceView(levels, hidden)
+        guess = geometry.inverted(found.reference_from_view)
+        exact = align_exactly(reference, self._levels.get(keyframe), guess)
+        if exact.reference_from_view is not None:
+            keyframe_from_frame = geometry.inverted(exact.reference_from_view)
+            link = link_of(keyframe, index, exact)
+        elif found.inliers >= _MIN_AGREEING_CELLS:
+            keyframe_from_frame = found.reference_from_view
+            link = link_of(index, keyframe, found)
+        else:
+            return False
+        world_from_keyframe = self.graph.keyframes[keyframe].world_from_keyframe
+        world_from_frame = geometry.normalized(world_from_keyframe @ keyframe_from_frame)
+        self._take(view, reference, world_from_frame, link)
+        self._go_over(index, np.eye(3))
+        self._loops.add(NewKeyframe(index, reference, keyframe))
+        return True
+
+    def _take(
+        self, view: FrameView, reference: ReferenceView, world_from_frame: Matrix, link: Link | None
+    ) -> None:
+        frame = view.frame
+        self.graph.add_keyframe(frame.index, frame.time_s, frame.image, world_from_frame)
+        if link is not None:
+            self.graph.add_link(link, is_loop=False)
+        self._levels.add(frame.index, reference.levels)
+        self._keep_reference(frame.index, reference)
+
+    def _reference(self, keyframe: int) -> ReferenceView:
+        reference = self._references.get(keyframe)
+        if reference is None:
+            reference = ReferenceView(self._levels.get(keyframe))
+            self._keep_reference(keyframe, reference)
+        return reference
+
+    def _keep_reference(self, keyframe: int, reference: ReferenceView) -> None:
+        self._references[keyframe] = reference
+        while len(self._references) > _REFERENCES_KEPT:
+            del self._references[next(iter(self._references))]
 
 
-def _has_moved_on(keyframe_from_frame: Matrix, pose: CameraPose, view: FrameView) -> bool:
-    quad = geometry.transform_points(keyframe_from_frame, geometry.image_quad(view.size_wh))
-    overlap = geometry.visible_share(quad, view.size_wh)
-    return overlap < _MIN_OVERLAP or pose.inliers < _MIN_KEYFRAME_INLIERS
+def _refused(found: ViewAlignment) -> CameraPose:
+    return CameraPose(None, len(found.is_inlier), found.inliers, reason=found.verdict)
 
 
-def _outside_targets(features: Features, tracks: Sequence[Track]) -> Features:
-    kept = np.ones(len(features), np.bool_)
-    for track in tracks:
-        if track.quad is not None:
-            hull = track.quad.reshape(-1, 1, 2)
-            kept &= [
-                cv2.pointPolygonTest(hull, (float(x), float(y)), False) < 0
-                for x, y in features.points
-            ]
-    return features[kept]
+def _without_jump(found: ViewAlignment, guess: Matrix, size_wh: Size) -> ViewAlignment:
+    """The alignment, refused if the view's area is not about what was expected."""
+    if found.reference_from_view is None:
+        return found
+    quad = geometry.image_quad(size_wh)
+    area = geometry.signed_area(geometry.transform_points(found.reference_from_view, quad))
+    expected = geometry.signed_area(geometry.transform_points(guess, quad))
+    if 1 / _MAX_AREA_JUMP <= area / expected <= _MAX_AREA_JUMP:
+        return found
+    return replace(found, verdict=Verdict.AREA, reference_from_view=None)
+
+
+def _overlap(found: ViewAlignment, size_wh: Size) -> float:
+    """Share of the view that its reference shows."""
+    assert found.reference_from_view is not None
+    quad = geometry.transform_points(found.reference_from_view, geometry.image_quad(size_wh))
+    return geometry.visible_share(quad, size_wh)
+
+
+def _stretch(world_from_frame: Matrix, size_wh: Size) -> float:
+    """Area of the box around the frame in the world, against the frame's own."""
+    quad = geometry.transform_points(world_from_frame, geometry.image_quad(size_wh))
+    if not np.isfinite(quad).all():
+        return float("inf")
+    x0, y0, x1, y1 = geometry.bounding_box(quad)
+    return (x1 - x0) * (y1 - y0) / (size_wh[0] * size_wh[1])

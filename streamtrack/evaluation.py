@@ -91,6 +91,27 @@ def corner_error(b_from_a: Matrix | None, true_b_from_a: Matrix, size_wh: Size) 
     return float(np.mean(_distances(_pi(b_from_a, corners), _pi(true_b_from_a, corners))))
 
 
+def visible_error(
+    b_from_a: Matrix | None, true_b_from_a: Matrix, a_wh: Size, b_wh: Size, *, grid: int = 40
+) -> float:
+    """Mean transfer error, px of b, over the pixels of a that b truly shows; infinite without.
+
+    1/|V| sum_V ||pi(H x) - pi(G x)||, V = {x in a: pi(G x) in b}: the MAE of the visible part of
+    Barath, Mishkin et al., "RANSAC in 2020" tutorial (CVPR 2020), on ``grid`` x ``grid`` pixels.
+    NaN if nothing is visible. Unlike the corner error it asks for no extrapolation.
+    """
+    x, y = np.meshgrid(np.linspace(0, a_wh[0] - 1, grid), np.linspace(0, a_wh[1] - 1, grid))
+    points = np.stack([x.ravel(), y.ravel()], axis=1)
+    true = _pi(true_b_from_a, points)
+    with np.errstate(invalid="ignore"):
+        is_visible = ((true >= 0) & (true <= np.array(b_wh) - 1)).all(axis=1)
+    if not is_visible.any():
+        return float("nan")
+    if b_from_a is None:
+        return float("inf")
+    return float(np.mean(_distances(_pi(b_from_a, points[is_visible]), true[is_visible])))
+
+
 def auc_at(errors: Iterable[float | None], threshold: float) -> float:
     """Area under the recall-error curve up to ``threshold``, over ``threshold``: 0..1.
 

@@ -37,6 +37,9 @@ _COARSE_STEPS = 2  # patches between the fine and the coarse alignment: half the
 _CLEAR = 0.8  # share of the points in view that agree
 _POINT_SIGMA_PX = 0.5  # patch pixels
 _HOLDING_STEPS = 2
+_BENT_INLIER_PX = 5.0  # patch pixels, from a similarity, for a target that is not flat
+_SEEN_SHARE = 0.5
+_CLEAR_OF_SEEN = 0.55
 _ROUGH = Effort((Model.AFFINE,), 0)
 _QUICK = Effort((Model.AFFINE, Model.HOMOGRAPHY), 1)
 
@@ -216,6 +219,16 @@ class FlowAligner:
             (2 * _SEARCH_PX) ** 2,
             effort,
         )
+        if settings.model == "auto" and _looks_bent(is_like, found):
+            loose = {"inlier_threshold_px": _BENT_INLIER_PX, "model": Model.SIMILARITY.value}
+            found = register(
+                patch.points[warp.visible][is_like],
+                moved[is_like],
+                settings.model_copy(update=loose),
+                geometry.transform_points(patch.patch_from_template, self._template.quad),
+                (2 * _SEARCH_PX) ** 2,
+                effort,
+            )
         is_inlier = np.zeros(len(moved), np.bool_)
         is_inlier[np.flatnonzero(is_like)[found.is_inlier]] = True
         if found.b_from_a is None:
@@ -233,6 +246,15 @@ class FlowAligner:
             return refused(verdict, len(moved), is_inlier)
         rmse_px = found.rmse_px * warp.frame_px
         return Registration(Verdict.OK, pose, found.model, is_inlier, rmse_px)
+
+
+def _looks_bent(is_like: Mask, found: Registration) -> bool:
+    """Is the target all there, (N,) points alike, but not where any one plane would put it?
+
+    An occluder hides points, so they are not alike; a bent or moving surface shifts them.
+    """
+    seen, agreeing = float(np.mean(is_like)), found.inliers / len(is_like)
+    return seen >= _SEEN_SHARE and agreeing < _CLEAR_OF_SEEN * seen
 
 
 def _held_by(

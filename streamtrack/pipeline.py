@@ -10,7 +10,7 @@ import numpy as np
 
 from streamtrack import geometry
 from streamtrack.budget import LEVELS, Budget
-from streamtrack.camera import make_camera
+from streamtrack.camera import CameraEstimator, make_camera
 from streamtrack.errors import TargetError, UsageError
 from streamtrack.features import FeatureExtractor
 from streamtrack.frame_view import FrameView
@@ -19,7 +19,9 @@ from streamtrack.sources.base import FrameSource
 from streamtrack.targets import Target, check_quad_in_picture
 from streamtrack.template import make_template
 from streamtrack.tracker import DetectTracker, HybridTracker, TargetTracker
-from streamtrack.types import Step, Track
+from streamtrack.types import Frame, Step, Track
+
+_MAX_GAP_S = 1.0
 
 
 def track(
@@ -30,20 +32,24 @@ def track(
     start: int = 0,
     step: int = 1,
     frames: int | None = None,
+    camera: CameraEstimator | None = None,
 ) -> Generator[Step]:
     """Follow targets through a source, one `Step` a frame.
 
     Quads are in pixels of the first frame that is used: frame ``start`` of the source, then every
-    ``step``-th, ``frames`` of them at most. Raises TargetError if a target cannot be tracked in
+    ``step``-th, ``frames`` of them at most. ``camera`` is the settings' own unless it is given.
+    When a live source was opened again (`Frame.epoch`), targets are looked for everywhere after a
+    longer gap or in a picture of another size. Raises TargetError if a target cannot be tracked in
     that frame, SourceError when the source breaks, UsageError if it has no frame ``start``.
     """
     settings = settings or Settings()
     extractors = _extractors(settings)
     budget = Budget(settings.tracker.budget_ms)
     trackers: list[TargetTracker] = []
-    camera = make_camera(settings)
+    camera = camera or make_camera(settings, is_live=source.info.is_live)
     stop = None if frames is None else start + max(0, (frames - 1) * step + 1)
     is_first = True
+    last: Frame | None = None
     for frame in islice(source, start, stop, step):
         began = time.perf_counter()
         work = budget.level
@@ -51,6 +57,10 @@ def track(
         if is_first:
             trackers = [make_tracker(target, view, extractors[0], settings) for target in targets]
             is_first = False
+        if last is not None and _is_elsewhere(last, frame):
+            for tracker in trackers:
+                tracker.forget_place()
+        last = frame
         tracks, track_ms = _follow_all(trackers, view)
         camera_began = time.perf_counter()
         pose = camera.update(view, tracks)
@@ -64,6 +74,13 @@ def track(
         yield Step(frame, tracks, pose, view.detected, stage_ms, work.index)
     if is_first and start > 0 and frames != 0:
         raise UsageError(f"the source has no frame {start}: it ended before")
+
+
+def _is_elsewhere(last: Frame, frame: Frame) -> bool:
+    """Is what was known of the last frame's places of no use in this one?"""
+    if frame.epoch == last.epoch:
+        return False
+    return frame.size_wh != last.size_wh or frame.time_s - last.time_s > _MAX_GAP_S
 
 
 def _extractors(settings: Settings) -> list[FeatureExtractor]:

@@ -21,28 +21,33 @@ _BLANK_GREY = 32
 
 
 class TargetLog:
-    """What one target adds to the recording."""
+    """What one target adds to the recording, once a part of it was begun."""
 
     def __init__(
         self,
         stream: rr.RecordingStream,
         name: str,
         number: int,
-        count: int,
         template: Image | None,
     ) -> None:
         self._stream = stream
         self._name = name
+        self._number = number
         self._entities = TargetEntities.of(name)
         self._state: TrackState | None = None
         self._frame_from_template: Matrix | None = None
         self._is_given_in_video: bool | None = None
         self._box: tuple[float, float, float, float] | None = None
         self._frames_to_close_up = 0
-        self._has_template = template is not None
-        blueprint.log_target_styles(stream, self._entities, name, number, count)
-        if template is not None:
-            self._log_template(_shrunk(template))
+        self._template = None if template is None else _shrunk(template)
+        self._is_first_in_part = True
+
+    def begin(self, count: int) -> None:
+        """Record what each part needs at its start, for one of ``count`` targets."""
+        blueprint.log_target_styles(self._stream, self._entities, self._name, self._number, count)
+        if self._template is not None:
+            self._log_template(self._template)
+        self._is_first_in_part = True
 
     def points_before(self, track: Track) -> Points | None:
         """Where the evidence's points were one step earlier, or else in the first frame."""
@@ -56,10 +61,11 @@ class TargetLog:
             pose = track.frame_from_template
             self._is_given_in_video = pose is not None and np.allclose(pose, np.eye(3), atol=1e-3)
         before, self._state = self._state, track.state
-        has_changed = before is not track.state
         message = ""
-        if has_changed:
+        if before is not track.state:
             message = _transition(step.frame.index, track, before)
+        if message or self._is_first_in_part:
+            self._is_first_in_part = False
             self._stream.log(self._entities.state, rr.StateChange(state=str(track.state)))
             self._frames_to_close_up = 0
         if track.quad is not None:
@@ -67,7 +73,7 @@ class TargetLog:
             self._log_close_up(step.frame.image, track)
         elif before is TrackState.TRACKING:
             self._stream.log(self._entities.drawing, rr.Clear(recursive=True))
-            self._log_no_close_up()
+            self._log_no_close_up(step.frame.image.shape[2:])
         self._log_numbers(track)
         self._frame_from_template = track.frame_from_template
         return message
@@ -101,16 +107,17 @@ class TargetLog:
         if self._box is None:
             self._box = bounding_box(transform_points(template_from_frame, track.quad))
         close_up = _upright(image, template_from_frame, self._box)
-        if not self._has_template:
-            self._has_template = True
+        if self._template is None:
+            self._template = close_up
             self._log_template(close_up)
         self._stream.log(self._entities.view, _jpeg(close_up))
 
-    def _log_no_close_up(self) -> None:
-        """A blank picture, for the viewer goes on showing a cleared one."""
+    def _log_no_close_up(self, channels: tuple[int, ...]) -> None:
+        """A blank picture, for the viewer goes on showing a cleared one, and of the same kind, for
+        it takes pictures in a row for a video."""
         if self._box is not None:
             size_wh, _ = _box_view(self._box)
-            blank = np.full((size_wh[1], size_wh[0]), _BLANK_GREY, np.uint8)
+            blank = np.full((size_wh[1], size_wh[0], *channels), _BLANK_GREY, np.uint8)
             self._stream.log(self._entities.view, _jpeg(blank))
 
     def _log_template(self, picture: Image) -> None:

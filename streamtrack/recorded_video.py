@@ -42,8 +42,14 @@ class Clock:
         self._is_live = is_live
         self._epoch_s: float | None = None
 
+    def follow(self, frame: Frame) -> None:
+        """Take over the wall time of a frame whose source knows it."""
+        if self._is_live and frame.captured_unix_s is not None:
+            self._epoch_s = frame.captured_unix_s - frame.time_s
+
     def set(self, index: int, time_s: float) -> None:
-        """``capture_time`` is the wall time of the first frame plus the source's own time since."""
+        """``capture_time`` is the wall time of the frame followed last plus the source's own time
+        since; without one, that of the first moment asked for."""
         self._stream.set_time("frame", sequence=index)
         self._stream.set_time("video_time", duration=time_s)
         if self._is_live:
@@ -53,7 +59,19 @@ class Clock:
 
 
 class Video(Protocol):
-    """One way of recording pictures."""
+    """One way of recording pictures, in one part (a file) or several that are each complete."""
+
+    def begin(self) -> None:
+        """Record what each part needs at its start."""
+        ...
+
+    def can_begin_at(self, frame: Frame) -> bool:
+        """Whether a part may begin with this frame, the next to be recorded."""
+        ...
+
+    def finish_before(self, frame: Frame) -> None:
+        """Record what belongs to the part that ends before this frame."""
+        ...
 
     def log(self, frame: Frame) -> int:
         """Record the picture, leaving any time on the clock. The bytes that it took, about."""
@@ -65,9 +83,16 @@ class Video(Protocol):
 
 
 def open_video(
-    stream: rr.RecordingStream, clock: Clock, source: SourceInfo, settings: RecordingSettings
+    stream: rr.RecordingStream,
+    clock: Clock,
+    source: SourceInfo,
+    settings: RecordingSettings,
+    has_parts: bool = False,
 ) -> Video:
-    """The cheapest way that the settings allow and the source can serve."""
+    """The cheapest way that the settings allow and the source can serve.
+
+    With parts no file is embedded, for each part would hold all of it.
+    """
     mode, codec = settings.video, source.packet_codec
     if mode is VideoMode.NONE:
         return without_video()
@@ -77,7 +102,7 @@ def open_video(
         if codec != "av1":
             _warn_if_ffmpeg_is_missing(codec)
         return _CopiedPackets(stream, clock, _CODECS[codec])
-    if mode is VideoMode.AUTO and source.asset_path is not None:
+    if mode is VideoMode.AUTO and source.asset_path is not None and not has_parts:
         try:
             video = _EmbeddedFile(stream, clock, source.asset_path, settings.max_asset_mb)
         except (OSError, RuntimeError, ValueError) as error:
@@ -98,6 +123,11 @@ def without_video() -> Video:
     return _NoVideo()
 
 
+def jpeg_video(stream: rr.RecordingStream, clock: Clock, quality: int) -> Video:
+    """Records each picture as JPEG."""
+    return _EncodedJpegs(stream, clock, quality)
+
+
 def _warn_if_ffmpeg_is_missing(codec: str) -> None:
     if shutil.which("ffmpeg") is None:
         _log.warning(
@@ -108,6 +138,15 @@ def _warn_if_ffmpeg_is_missing(codec: str) -> None:
 
 
 class _NoVideo:
+    def begin(self) -> None:
+        pass
+
+    def can_begin_at(self, frame: Frame) -> bool:
+        return True
+
+    def finish_before(self, frame: Frame) -> None:
+        pass
+
     def log(self, frame: Frame) -> int:
         return 0
 
@@ -115,21 +154,20 @@ class _NoVideo:
         pass
 
 
-class _EncodedJpegs:
+class _EncodedJpegs(_NoVideo):
     def __init__(self, stream: rr.RecordingStream, clock: Clock, quality: int) -> None:
         self._stream = stream
         self._clock = clock
         self._quality = quality
-        _log_jpeg_style(stream)
+
+    def begin(self) -> None:
+        _log_jpeg_style(self._stream)
 
     def log(self, frame: Frame) -> int:
         data = jpeg_of(frame.image, self._quality)
         self._clock.set(frame.index, frame.time_s)
         self._stream.log(IMAGE, rr.EncodedImage.from_fields(blob=data))
         return len(data)
-
-    def close(self) -> None:
-        pass
 
 
 def jpeg_of(image: Image, quality: int) -> bytes:
@@ -153,21 +191,44 @@ class _PacketQueue:
 
     def __init__(self) -> None:
         self._waiting: deque[Packet] = deque()
+        self._due: list[Packet] = []
+        self._last: Frame | None = None
 
     def due(self, frame: Frame) -> list[Packet]:
-        self._waiting.extend(frame.packets)
-        now = frame.time_s + _SAME_TIME_S
-        packets: list[Packet] = []
-        while self._waiting and (
-            self._waiting[0].time_s <= now or len(self._waiting) > _MAX_WAITING
-        ):
-            packets.append(self._waiting.popleft())
+        """Those to be recorded with this frame; asked again, those not yet taken."""
+        if frame is not self._last:
+            self._last = frame
+            self._waiting.extend(frame.packets)
+            now = frame.time_s + _SAME_TIME_S
+            while self._waiting and (
+                self._waiting[0].time_s <= now or len(self._waiting) > _MAX_WAITING
+            ):
+                self._due.append(self._waiting.popleft())
+        return self._due
+
+    def take(self, frame: Frame) -> list[Packet]:
+        packets = self.due(frame)
+        self._due = []
         return packets
 
+    def take_before_keyframe(self, frame: Frame) -> list[Packet]:
+        """Takes what stands before the last keyframe due, or all if there is none."""
+        packets = self.due(frame)
+        first = _last_keyframe(packets)
+        first = len(packets) if first is None else first
+        self._due = packets[first:]
+        return packets[:first]
+
     def rest(self) -> list[Packet]:
-        packets = list(self._waiting)
+        packets = [*self._due, *self._waiting]
+        self._due = []
         self._waiting.clear()
         return packets
+
+
+def _last_keyframe(packets: list[Packet]) -> int | None:
+    places = [place for place, packet in enumerate(packets) if packet.is_keyframe]
+    return places[-1] if places else None
 
 
 class _SampleLog:
@@ -176,10 +237,13 @@ class _SampleLog:
     def __init__(self, stream: rr.RecordingStream, clock: Clock, codec: rr.VideoCodec) -> None:
         self._stream = stream
         self._clock = clock
+        self._codec = codec
         self._last_s = -np.inf
-        stream.log(
+
+    def begin(self) -> None:
+        self._stream.log(
             IMAGE,
-            rr.VideoStream.from_fields(codec=codec, draw_order=_BEHIND_OVERLAYS),
+            rr.VideoStream.from_fields(codec=self._codec, draw_order=_BEHIND_OVERLAYS),
             static=True,
         )
 
@@ -201,10 +265,26 @@ class _CopiedPackets:
         self._samples = _SampleLog(stream, clock, codec)
         self._next_index = 0
 
+    def begin(self) -> None:
+        self._samples.begin()
+
+    def can_begin_at(self, frame: Frame) -> bool:
+        return _last_keyframe(self._queue.due(frame)) is not None
+
+    def finish_before(self, frame: Frame) -> None:
+        count = len(self._queue.due(frame))
+        self._log(frame, count, self._queue.take_before_keyframe(frame))
+
     def log(self, frame: Frame) -> int:
-        packets = self._queue.due(frame)
-        first = max(frame.index - len(packets) + 1, self._next_index)
+        packets = self._queue.take(frame)
+        size = self._log(frame, len(packets), packets)
         self._next_index = frame.index + 1
+        return size
+
+    def _log(self, frame: Frame, count: int, packets: list[Packet]) -> int:
+        """The first of ``count`` packets, the last of which shows the frame."""
+        first = max(frame.index - count + 1, self._next_index)
+        self._next_index = min(first + len(packets), frame.index)
         return sum(
             self._samples.log(min(first + number, frame.index), packet)
             for number, packet in enumerate(packets)
@@ -215,27 +295,26 @@ class _CopiedPackets:
             self._samples.log(index, packet)
 
 
-class _CopiedJpegs:
+class _CopiedJpegs(_NoVideo):
     def __init__(self, stream: rr.RecordingStream, clock: Clock) -> None:
         self._queue = _PacketQueue()
         self._stream = stream
         self._clock = clock
-        _log_jpeg_style(stream)
+
+    def begin(self) -> None:
+        _log_jpeg_style(self._stream)
 
     def log(self, frame: Frame) -> int:
-        packets = self._queue.due(frame)
+        packets = self._queue.take(frame)
         if not packets:
             return 0
         self._clock.set(frame.index, frame.time_s)
         self._stream.log(IMAGE, rr.EncodedImage.from_fields(blob=packets[-1].data))
         return len(packets[-1].data)
 
-    def close(self) -> None:
-        pass
 
-
-class _EncodedAv1:
-    """A new size of picture starts a new encoder in the same stream, on a keyframe."""
+class _EncodedAv1(_NoVideo):
+    """A new part or size of picture starts a new encoder, on a keyframe."""
 
     def __init__(
         self, stream: rr.RecordingStream, clock: Clock, size_wh: Size, rate_hz: float | None
@@ -245,14 +324,19 @@ class _EncodedAv1:
         self._samples = _SampleLog(stream, clock, rr.VideoCodec.AV1)
         self._indices: deque[int] = deque()
 
+    def begin(self) -> None:
+        self._samples.begin()
+
+    def finish_before(self, frame: Frame) -> None:
+        self._log_packets(self._encoder.flush())
+        self._indices.clear()
+        self._encoder = Av1Encoder(frame.size_wh, self._rate_hz)
+
     def log(self, frame: Frame) -> int:
-        size = 0
         if frame.size_wh != self._encoder.size_wh:
-            size += self._log_packets(self._encoder.flush())
-            self._indices.clear()
-            self._encoder = Av1Encoder(frame.size_wh, self._rate_hz)
+            self.finish_before(frame)
         self._indices.append(frame.index)
-        return size + self._log_packets(self._encoder.encode(frame.image, frame.time_s))
+        return self._log_packets(self._encoder.encode(frame.image, frame.time_s))
 
     def close(self) -> None:
         self._log_packets(self._encoder.flush())
@@ -261,7 +345,7 @@ class _EncodedAv1:
         return sum(self._samples.log(self._indices.popleft(), packet) for packet in packets)
 
 
-class _EmbeddedFile:
+class _EmbeddedFile(_NoVideo):
     """The source's file, whole; each frame refers to its picture in there."""
 
     def __init__(
@@ -276,8 +360,14 @@ class _EmbeddedFile:
             raise ValueError("no picture in it")
         self._stream = stream
         self._clock = clock
-        stream.log(IMAGE, asset, static=True)
-        stream.log(
+        self._asset: rr.AssetVideo | None = asset
+
+    def begin(self) -> None:
+        if self._asset is None:
+            raise RuntimeError("an embedded file cannot be recorded in parts")
+        self._stream.log(IMAGE, self._asset, static=True)
+        self._asset = None  # the memory is wanted back
+        self._stream.log(
             IMAGE,
             rr.VideoFrameReference.from_fields(draw_order=_BEHIND_OVERLAYS),
             static=True,
@@ -288,9 +378,6 @@ class _EmbeddedFile:
         time_ns = self._nearest(frame.time_s)
         self._stream.log(IMAGE, rr.VideoFrameReference.from_fields(timestamp=time_ns))
         return 0
-
-    def close(self) -> None:
-        pass
 
     def _nearest(self, time_s: float) -> int:
         """The file's own time of the picture that is ``time_s`` after its first."""

@@ -1,47 +1,45 @@
 """Recording a run for the Rerun viewer.
 
 The file is the record of truth. Killed at any moment, a run leaves a file that opens and misses at
-most the last `_FLUSH_EVERY_S` (``rerun rrd optimize`` mends its end). A disk that fills up ends the
-recording with one warning, and tracking goes on.
+most the last 0.2 s; the next run of the same series mends its end. A disk that fills up ends the
+recording with one warning, and tracking goes on; a recording in several files goes on as well, in
+a new one, once there is room.
 """
 
 from __future__ import annotations
 
-import datetime
 import logging
-import math
-import os
 import threading
 import time
-from collections.abc import Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import numpy as np
-import numpy.typing as npt
-import rerun as rr
-
-from streamtrack import blueprint, recorded_rows
+from streamtrack import blueprint
 from streamtrack.errors import OutputError
-from streamtrack.recorded_target import TargetLog
-from streamtrack.recorded_video import Clock, open_video, without_video
+from streamtrack.mosaic.types import MosaicView
+from streamtrack.recorded_file import RecordingFiles, free_bytes, new_stream, reserve_bytes
+from streamtrack.recorded_steps import StepLog
+from streamtrack.recorded_video import Clock, open_video
+from streamtrack.repair import is_whole, mend
+from streamtrack.rotation import FileSeries, Limit, check_keep, parse_keep, parse_rotate
 from streamtrack.settings import Settings
-from streamtrack.types import Image, Mask, SourceInfo, Step, Track, TrackState
+from streamtrack.types import Image, Matrix, Size, SourceInfo, Step
 from streamtrack.viewer import view
 
-__all__ = ["Recorder", "view"]
+__all__ = ["Recorder", "RunLogHandler", "timeline_of", "view"]
 
 _log = logging.getLogger("streamtrack.recording")
 
-_FLUSH_EVERY_S = 0.2
-_FLUSH_BYTES = 1 << 19
-_RESERVE_BYTES = 1 << 21
-"""Space kept on the disk so that a recording can still be ended properly."""
-_RESERVE_PICTURES = 8
-_GROWTH_CHECK_S = 5.0
 _MEND = "'rerun rrd optimize FILE -o WHOLE' makes the file so far whole"
+_RESUME_EVERY_S = 60.0
+_RESUME_BYTES = 1 << 25
+"""Space that must be free, beyond the reserve, before a recording that had ended goes on."""
+_TIDY_EVERY_S = 60.0
+_TIDY_END_S = 1.0
+_LATE = 2.0
+"""A new file begins without a keyframe once the one before is so many times too large or old."""
 
 _LEVELS = {
     logging.CRITICAL: "CRITICAL",
@@ -55,10 +53,12 @@ _LEVELS = {
 class Recorder:
     """Writes each `Step` of a run to an .rrd file, with the layout to view it in.
 
+    With ``settings.recording.rotate`` it becomes a series of files beside ``path``, each complete
+    by itself (`streamtrack.rotation`); with ``keep`` the oldest of them are removed.
     ``template_views`` are the targets' pictures as they were given, by name; a target without one
     gets its first close-up instead. Log records of the logger ``streamtrack`` go in as well.
-    ``failed`` says why recording ended early, and is None while all is well. Raises OutputError
-    if the file cannot be written.
+    ``path`` is the file that is being written; ``failed`` says why recording ended early, and is
+    None while all is well. Raises OutputError if the file cannot be written.
     """
 
     def __init__(
@@ -68,42 +68,39 @@ class Recorder:
         settings: Settings,
         target_names: Sequence[str],
         template_views: Mapping[str, Image] | None = None,
+        has_mosaic: bool = False,
     ) -> None:
-        self.path = path
         self.failed: str | None = None
         self._source = source
         self._lock = threading.RLock()
-        self._templates = dict(template_views or {})
-        self._frames = 0
-        self._last_frame = (0, 0.0)
-        self._picture_bytes = 0
-        self._has_points = False
-        self._stages: dict[str, str] = {}
-        self._last_stages: set[str] = set()
-        self._growth = (time.monotonic(), 0)
         self._is_closed = False
-        _check_writable(path)
+        self._began = (0.0, 0.0)
+        self._resume_at = 0.0
+        self._rotate = parse_rotate(settings.recording.rotate)
+        keep = parse_keep(settings.recording.keep)
+        check_keep(self._rotate, keep)
+        self._series = None if self._rotate is None else FileSeries(path)
+        self.path = path if self._series is None else self._series.next_path()
 
-        timeline = "video_time" if source.is_live or source.rate_hz else "frame"
-        layout = blueprint.build(source.size_wh, target_names, timeline)
-        batching = rr.ChunkBatcherConfig.DEFAULT()
-        batching.flush_tick = datetime.timedelta(seconds=_FLUSH_EVERY_S)
-        batching.flush_num_bytes = _FLUSH_BYTES
-        self._stream = rr.RecordingStream(blueprint.APPLICATION_ID, batcher_config=batching)
-        try:
-            self._stream.save(path, default_blueprint=layout)
-        except (OSError, RuntimeError) as error:
-            raise OutputError(f"recording {path} cannot be written: {error}") from None
-        self._clock = Clock(self._stream, source.is_live)
-        self._handler = _LogHandler(self)
-        logging.getLogger("streamtrack").addHandler(self._handler)
-        self._summary = _run_summary(source, settings, target_names)
-        self._log_start(settings)
-        self._target_count = len(target_names)
-        self._targets: dict[str, TargetLog] = {}
-        for name in target_names:
-            self._target(name)
-        self._video = open_video(self._stream, self._clock, source, settings.recording)
+        layout = blueprint.build(
+            source.size_wh, target_names, timeline_of(source), has_mosaic, source.is_live
+        )
+        self._stream = new_stream()
+        self._files = RecordingFiles(self._stream, layout)
+        clock = Clock(self._stream, source.is_live)
+        has_parts = self._series is not None
+        self._files.open(self.path)
+        self._steps = StepLog(
+            self._stream, clock, source, settings, target_names, template_views or {}
+        )
+        self._handler = RunLogHandler(self.log_text)
+        self._handler.attach()
+        self._steps.video = open_video(self._stream, clock, source, settings.recording, has_parts)
+        self._steps.begin()
+        self._tidier = None
+        if self._series is not None:
+            reserve = 0 if self._rotate is None else self._rotate.size_bytes or 0
+            self._tidier = _Tidier(self._series, keep, reserve)
 
     def __enter__(self) -> Self:
         return self
@@ -122,228 +119,242 @@ class Recorder:
 
     def log(self, step: Step) -> None:
         """Record all that one frame produced."""
-        if not self.is_recording:
+        if self._is_closed or (self.failed is not None and not self._resumed()):
             return
         with self._lock:
-            if (trouble := self._trouble_with_disk()) is not None:
+            trouble = self._files.trouble(self._steps.picture_bytes)
+            if trouble is None and self._is_next_due(step):
+                trouble = self._begin_next(step)
+            if trouble is not None:
                 self._stop(trouble)
                 return
-            self._log_picture(step)
-            self._last_frame = (step.frame.index, step.frame.time_s)
-            self._clock.set(*self._last_frame)
-            self._log_points(step)
-            for track in step.tracks:
-                message = self._target(track.name).log(step, track)
-                if message:
-                    self._log_line(_level_of(track.state), message)
-            self._log_times(step)
-            self._frames += 1
+            if self._steps.frames == 0:
+                self._began = self._now(step)
+            self._steps.log(step)
 
     def log_text(self, level: str, message: str) -> None:
         """Add a line to the log at the time of the last frame; levels are Python's names."""
-        if not self.is_recording:
-            return
-        with self._lock:
-            self._clock.set(*self._last_frame)  # the timelines are each thread's own
-            self._log_line(level, message)
+        if self.is_recording:
+            with self._lock:
+                self._steps.log_text(level, message)
+
+    def log_source(
+        self, state: str, counts: Mapping[str, int] | None = None, time_s: float | None = None
+    ) -> None:
+        """The state of a live source (connecting, streaming, stalled, waiting, ended).
+
+        ``counts`` says how many frames were not seen so far, by the reason (``dropped``, ``lost``
+        ...), ``time_s`` when that was on the source's clock, by default at the last frame. Only
+        what changed is recorded.
+        """
+        if self.is_recording:
+            with self._lock:
+                self._steps.log_source(state, counts or {}, time_s)
+
+    def is_mosaic_due(self, time_s: float) -> bool:
+        """Whether `log_mosaic` would record a view of the frame at this time; else spare it."""
+        return self.is_recording and self._steps.mosaic.is_image_due(time_s)
+
+    def log_mosaic(self, view: MosaicView, index: int, time_s: float) -> None:
+        """Record the mosaic as it is after a frame, at most once a second of the source's clock,
+        and the last one at the end."""
+        if self.is_recording:
+            with self._lock:
+                self._steps.set_time(index, time_s)
+                self._steps.mosaic.log_view(view, time_s)
+
+    def log_mosaic_frame(
+        self,
+        index: int,
+        time_s: float,
+        size_wh: Size,
+        world_from_frame: Matrix | None,
+        state: str,
+        reason: str = "",
+        metrics: Mapping[str, float] | None = None,
+    ) -> None:
+        """Record where a frame came to lie on the mosaic, after its `log`.
+
+        ``state`` is ``placed``, ``refused`` or ``lost``, ``world_from_frame`` None unless placed.
+        """
+        if self.is_recording:
+            with self._lock:
+                self._steps.log_mosaic_frame(
+                    index, time_s, size_wh, world_from_frame, state, reason, metrics or {}
+                )
 
     def close(self, summary_markdown: str = "") -> None:
         """End the file; closing again does nothing."""
-        if not self.is_recording:
+        if self._is_closed:
             return
+        if self._tidier is not None:
+            self._tidier.close()  # its lines still go into the log
         with self._lock:
-            self._video.close()
-            text = summary_markdown or f"{self._summary}| frames | {self._frames} |\n"
-            self._log_summary(text)
-            if not self._finish():
+            was_recording, self._is_closed = self.is_recording, True
+            self._handler.detach()
+            if not was_recording:
+                return
+            self._steps.close(summary_markdown)
+            if not self._files.close():
                 self.failed = "its end could not be written"
                 _log.warning("recording %s is not complete: %s", self.path, _MEND)
 
-    def _log_start(self, settings: Settings) -> None:
-        source = self._source
-        self._stream.send_recording_name(source.name)
-        self._stream.send_recording_start_time_nanos(time.time_ns())
-        self._stream.send_property(
-            "run",
-            rr.AnyValues(
-                version=_version(),
-                source=source.name,
-                detector=settings.features.detector,
-                descriptor=settings.features.descriptor,
-                width=source.size_wh[0],
-                height=source.size_wh[1],
-                rate_hz=math.nan if source.rate_hz is None else source.rate_hz,
-                settings=settings.model_dump_json(),
-            ),
+    def _now(self, step: Step) -> tuple[float, float]:
+        """The source's clock and this machine's."""
+        return step.frame.time_s, time.monotonic()
+
+    def _is_next_due(self, step: Step) -> bool:
+        if self._rotate is None or self._steps.frames == 0:
+            return False
+        video_s, wall_s = (
+            now - then for now, then in zip(self._now(step), self._began, strict=True)
         )
-        blueprint.log_styles(self._stream)
-        self._log_summary(self._summary)
+        age_s = wall_s if self._source.is_live else video_s
+        size = self._files.size_bytes() + self._steps.picture_bytes
+        if not self._rotate.is_reached(size, age_s):
+            return False
+        is_late = self._rotate.is_reached(size / _LATE, age_s / _LATE)
+        return is_late or self._steps.can_begin_at(step.frame)
 
-    def _log_summary(self, markdown: str) -> None:
-        document = rr.TextDocument(markdown, media_type="text/markdown")
-        self._stream.log(blueprint.SUMMARY, document, static=True)
-
-    def _log_line(self, level: str, message: str) -> None:
-        self._stream.log(blueprint.LOG, rr.TextLog(message, level=level))
-
-    def _target(self, name: str) -> TargetLog:
-        """The target's part of the recording, begun when it is first asked for."""
-        if name not in self._targets:
-            number, template = len(self._targets), self._templates.get(name)
-            self._targets[name] = TargetLog(
-                self._stream, name, number, max(self._target_count, number + 1), template
-            )
-        return self._targets[name]
-
-    def _log_picture(self, step: Step) -> None:
+    def _begin_next(self, step: Step) -> str | None:
+        """Go on in a new file from this frame on; what is wrong if that fails."""
+        assert self._series is not None
+        self._steps.finish_before(step.frame)
         try:
-            self._picture_bytes = self._video.log(step.frame)
+            path = self._series.next_path()
+            self._files.open(path)
         except OutputError as error:
-            self._video = without_video()
-            _log.warning("from frame %d on no picture is recorded: %s", step.frame.index, error)
-
-    def _log_points(self, step: Step) -> None:
-        """Points and lines of all targets, in one batch each; the important ones drawn last."""
-        evidence = [track.evidence for track in step.tracks]
-        loose = [one.unmatched_points for one in evidence]
-        if step.features is not None and not any(len(points) for points in loose):
-            loose.append(step.features.points)
-        found = [one.frame_points for one in evidence]
-        points = np.concatenate([*loose, *found]) if loose else np.zeros((0, 2), np.float32)
-        if not self._has_points and not len(points):
-            return
-        self._has_points = len(points) > 0
-        classes = np.full(len(points), blueprint.UNMATCHED, np.uint16)
-        agreeing = [_classes(one.is_inlier) for one in evidence]
-        if agreeing:
-            paired = np.concatenate(agreeing)
-            classes[len(points) - len(paired) :] = paired
-        self._stream.log(blueprint.KEYPOINTS, recorded_rows.points(points, classes))
-        self._log_lines(step.tracks)
-
-    def _log_lines(self, tracks: Sequence[Track]) -> None:
-        """How the points of the evidence moved since the step before."""
-        lines = [np.zeros((0, 2, 2), np.float32)]
-        classes = [np.zeros(0, np.uint16)]
-        for track in tracks:
-            start = self._target(track.name).points_before(track)
-            if start is not None:
-                lines.append(np.stack([start, track.evidence.frame_points], axis=1))
-                classes.append(_classes(track.evidence.is_inlier))
-        self._stream.log(
-            blueprint.MATCHES, recorded_rows.strips(np.concatenate(lines), np.concatenate(classes))
-        )
-
-    def _log_times(self, step: Step) -> None:
-        if step.features is not None:
-            self._stream.log(blueprint.FEATURE_COUNT, recorded_rows.scalar(len(step.features)))
-        for stage, milliseconds in step.stage_ms.items():
-            self._stream.log(self._stage_path(stage), recorded_rows.scalar(milliseconds))
-        for stage in self._last_stages - step.stage_ms.keys():
-            self._stream.log(self._stage_path(stage), recorded_rows.scalar(math.nan))
-        self._last_stages = set(step.stage_ms)
-
-    def _stage_path(self, stage: str) -> str:
-        if stage == "total":
-            return blueprint.TOTAL_MS
-        if stage not in self._stages:
-            path = rr.new_entity_path([*blueprint.TOTAL_MS.split("/"), stage])
-            blueprint.log_stage_style(self._stream, path, stage, len(self._stages))
-            self._stages[stage] = path
-        return self._stages[stage]
-
-    def _trouble_with_disk(self) -> str | None:
-        """Why recording has to end, before Rerun gives up by itself in the middle of a message."""
-        reserve = _RESERVE_BYTES + _RESERVE_PICTURES * self._picture_bytes
-        try:
-            disk = os.statvfs(self.path.parent)
-            if disk.f_bavail * disk.f_frsize < reserve:
-                return "the disk is full"
-            since, size = self._growth
-            now = time.monotonic()
-            if now - since > _GROWTH_CHECK_S:
-                self._growth = (now, self.path.stat().st_size)
-                if self._growth[1] == size:
-                    self._stream.flush(timeout_sec=1.0)
-        except OSError as error:
-            return str(error.strerror or error)
-        except (RuntimeError, ValueError) as error:
-            return f"the file cannot be written any more ({error})"
+            return str(error)
+        self.path = path
+        self._began = self._now(step)
+        self._steps.begin()
+        if self._tidier is not None:
+            self._tidier.wake()
         return None
 
     def _stop(self, reason: str) -> None:
-        self.failed = reason
-        self._log_line("ERROR", f"recording ended: {reason}")
-        is_whole = self._finish()
+        self._steps.log_text("ERROR", f"recording ended: {reason}")
+        self.failed = reason  # from here on no line of the log goes in
+        self._resume_at = time.monotonic() + _RESUME_EVERY_S
+        is_file_whole = self._files.close()
         _log.warning(
             "recording to %s ended at frame %d: %s; tracking goes on, and %s",
             self.path,
-            self._last_frame[0],
+            self._steps.last_frame[0],
             reason,
-            "the file so far is whole" if is_whole else _MEND,
+            "the file so far is whole" if is_file_whole else _MEND,
         )
 
-    def _finish(self) -> bool:
-        """End the file; False if its end could not be written."""
-        self._is_closed = True
-        logging.getLogger("streamtrack").removeHandler(self._handler)
-        is_whole = True
-        try:
-            self._stream.flush(timeout_sec=30.0)
-        except (RuntimeError, ValueError):
-            is_whole = False
-        self._stream.disconnect()
-        return is_whole
+    def _resumed(self) -> bool:
+        """Whether a series goes on in a new file, which is tried once a minute."""
+        now = time.monotonic()
+        if self._series is None or now < self._resume_at:
+            return False
+        self._resume_at = now + _RESUME_EVERY_S
+        wanted = reserve_bytes(self._steps.picture_bytes) + _RESUME_BYTES
+        with self._lock:
+            try:
+                if free_bytes(self.path.parent) < wanted:
+                    return False
+                path = self._series.next_path()
+                self._files.open(path)
+            except (OSError, OutputError):
+                return False
+            self.path, self.failed = path, None
+            self._began = (self._steps.last_frame[1], now)
+            self._steps.begin()
+        _log.warning("recording goes on in %s", path)
+        return True
 
 
-class _LogHandler(logging.Handler):
-    """Routes log records of any thread into the recording."""
+class RunLogHandler(logging.Handler):
+    """Routes log records of the package, of any thread, to ``log_text(level, message)``.
 
-    def __init__(self, recorder: Recorder) -> None:
+    From INFO on, whatever is shown elsewhere; at the end the logger's level is as it was.
+    """
+
+    def __init__(self, log_text: Callable[[str, str], None]) -> None:
         super().__init__(logging.INFO)
-        self._recorder = recorder
+        self._log_text = log_text
+        self._logger = logging.getLogger("streamtrack")
+        self._level_before: int | None = None
+
+    def attach(self) -> None:
+        if not self._logger.isEnabledFor(logging.INFO):
+            self._level_before = self._logger.level
+            self._logger.setLevel(logging.INFO)
+        self._logger.addHandler(self)
+
+    def detach(self) -> None:
+        self._logger.removeHandler(self)
+        if self._level_before is None:
+            return
+        for other in self._logger.handlers:
+            if isinstance(other, RunLogHandler):
+                other._level_before = self._level_before  # it is left to the last one
+                return
+        self._logger.setLevel(self._level_before)
+
+    def handle(self, record: logging.LogRecord) -> bool:
+        """Without the handler's own lock, which would be taken in either order with the others."""
+        is_wanted = bool(self.filter(record))
+        if is_wanted:
+            self.emit(record)
+        return is_wanted
 
     def emit(self, record: logging.LogRecord) -> None:
-        level = _LEVELS.get(record.levelno, record.levelname)
-        self._recorder.log_text(level, record.getMessage())
+        self._log_text(_LEVELS.get(record.levelno, record.levelname), record.getMessage())
 
 
-def _check_writable(path: Path) -> None:
-    """Make the folder and an empty file. Raises OutputError if that fails."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("wb"):
-            pass
-    except OSError as error:
-        raise OutputError(f"recording {path}: {error.strerror or error}") from None
+class _Tidier:
+    """Mends what a killed run left, once, and removes what is not to be kept, aside of tracking."""
+
+    def __init__(self, series: FileSeries, keep: Limit | None, reserve_bytes: int) -> None:
+        self._series = series
+        self._keep = keep
+        self._reserve = reserve_bytes
+        self._wake = threading.Event()
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="recording-files", daemon=True)
+        self._thread.start()
+
+    def wake(self) -> None:
+        """A new file was begun."""
+        self._wake.set()
+
+    def close(self) -> None:
+        self._end.set()
+        self._wake.set()
+        self._thread.join(_TIDY_END_S)
+
+    def _run(self) -> None:
+        self._remove()
+        self._mend()
+        while not self._end.is_set():
+            self._wake.wait(_TIDY_EVERY_S)
+            self._wake.clear()
+            self._remove()
+
+    def _mend(self) -> None:
+        try:
+            unfinished = [path for path in self._series.paths() if not is_whole(path)]
+        except OSError as error:
+            _log.warning("the recordings so far cannot be read: %s", error)
+            return
+        for path in unfinished:
+            if not self._end.is_set() and (message := mend(path, self._end)):
+                _log.warning("%s", message)
+
+    def _remove(self) -> None:
+        if self._keep is None:
+            return
+        try:
+            for path, reason in self._series.remove_beyond(self._keep, self._reserve):
+                _log.info("removed %s: %s", path, reason)
+        except OSError as error:
+            _log.warning("old recordings cannot be removed: %s", error.strerror or error)
 
 
-def _version() -> str:
-    try:
-        return version("streamtrack")
-    except PackageNotFoundError:
-        return "unknown"
-
-
-def _run_summary(source: SourceInfo, settings: Settings, target_names: Sequence[str]) -> str:
-    rate = "" if source.rate_hz is None else f", {source.rate_hz:g} Hz"
-    rows = {
-        "source": source.name,
-        "picture": f"{source.size_wh[0]} x {source.size_wh[1]}{rate}",
-        "targets": ", ".join(target_names) or "none",
-        "detector": settings.features.detector,
-        "descriptor": settings.features.descriptor,
-        "method": settings.tracker.method,
-        "model": settings.registration.model,
-        "camera": settings.camera,
-    }
-    lines = [f"| {key} | {value.replace('|', '/')} |\n" for key, value in rows.items()]
-    return f"# {source.name}\n\n| | |\n|---|---|\n" + "".join(lines)
-
-
-def _classes(is_inlier: Mask) -> npt.NDArray[np.uint16]:
-    return np.where(is_inlier, blueprint.INLIER, blueprint.OUTLIER).astype(np.uint16)
-
-
-def _level_of(state: TrackState) -> str:
-    return "WARN" if state is TrackState.LOST else "INFO"
+def timeline_of(source: SourceInfo) -> str:
+    """The timeline that the viewer opens with."""
+    return "video_time" if source.is_live or source.rate_hz else "frame"

@@ -27,7 +27,7 @@ import numpy as np
 from streamtrack.errors import UsageError
 from streamtrack.geometry import bounding_box
 from streamtrack.outputs import Closing, RecordFile, open_output, output_error
-from streamtrack.types import Skipped, Step, Track
+from streamtrack.types import Matrix, Skipped, Step, Track
 
 _BATCH_ROWS = 1024
 _GROUP_BATCHES = 64
@@ -306,13 +306,21 @@ class PosesWriter(RecordFile):
 
     def write(self, step: Step) -> None:
         """Add the pose of one frame. Raises OutputError."""
-        frame, pose = step.frame, step.camera.world_from_frame
-        time_s = _csv_cell("time_s", _finite(frame.time_s))
-        if pose is None:
-            self._add(frame.index, frame.name, time_s, "skipped", step.camera.reason, [""] * 9)
+        frame, camera = step.frame, step.camera
+        self.write_pose(
+            frame.index, frame.name, frame.time_s, camera.world_from_frame, camera.reason
+        )
+
+    def write_pose(
+        self, index: int, name: str, time_s: float, world_from_frame: Matrix | None, reason: str
+    ) -> None:
+        """Add a frame's pose, or why it has none. Raises OutputError."""
+        time_cell = _csv_cell("time_s", _finite(time_s))
+        if world_from_frame is None:
+            self._add(index, name, time_cell, "skipped", reason, [""] * 9)
         else:
-            elements = [str(float(value)) for value in pose.ravel()]
-            self._add(frame.index, frame.name, time_s, "used", "", elements)
+            elements = [str(float(value)) for value in world_from_frame.ravel()]
+            self._add(index, name, time_cell, "used", "", elements)
 
     def write_skipped(self, skipped: Skipped) -> None:
         """Add a picture that the source left out; its time is not known. Raises OutputError."""

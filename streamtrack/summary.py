@@ -30,7 +30,10 @@ from streamtrack.budget import LEVELS
 from streamtrack.meters import LogHistogram, Mean, nearest_rank, peak_rss_mb
 from streamtrack.outputs import write_file
 from streamtrack.settings import Settings
+from streamtrack.sources.live_status import LiveStatus
 from streamtrack.types import Size, Skipped, SourceInfo, Step, Track, TrackState
+
+_LIVE_COUNTS = ("captured", "dropped", "thinned", "lost", "damaged", "reconnects", "stalls")
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +136,7 @@ class Summary:
     skipped: tuple[Skipped, ...]
     corrupt_packets: int
     ended: str
+    live: LiveStatus | None = None
 
     @property
     def fps(self) -> float | None:
@@ -185,6 +189,7 @@ class Summary:
                 for item in self.skipped
             ],
             "corrupt_packets": self.corrupt_packets,
+            "live": self._live_json(),
             "ended": self.ended,
         }
 
@@ -214,8 +219,27 @@ class Summary:
             ("Frames a second", f"{_number(self.fps, 1)}, reading and writing included"),
             ("Peak memory", f"{self.peak_rss_mb:.0f} MB"),
             ("Corrupt packets", str(self.corrupt_packets)),
+            *self._live_rows(),
             ("Skipped pictures", str(len(self.skipped))),
             ("Ended", self.ended),
+        ]
+
+    def _live_json(self) -> dict[str, Any] | None:
+        if self.live is None:
+            return None
+        counts = {name: getattr(self.live, name) for name in _LIVE_COUNTS}
+        age_ms = {"p50": self.live.age_ms_p50, "p95": self.live.age_ms_p95}
+        return {**counts, "away_s": self.live.away_s, "frame_age_ms": age_ms}
+
+    def _live_rows(self) -> list[tuple[str, str]]:
+        live = self.live
+        if live is None:
+            return []
+        counts = ", ".join(f"{name} {getattr(live, name)}" for name in _LIVE_COUNTS)
+        p50, p95 = _number(live.age_ms_p50, 0), _number(live.age_ms_p95, 0)
+        return [
+            ("Live pictures", f"{counts}, away {live.away_s:.1f} s"),
+            ("Age of a frame when done", f"median {p50} ms, p95 {p95} ms"),
         ]
 
     def _budget_json(self) -> dict[str, Any] | None:
@@ -329,8 +353,17 @@ class SummaryBuilder:
             if math.isfinite(ms):
                 self._stage_ms[name] = self._stage_ms.get(name, 0.0) + ms
 
-    def build(self, skipped: Sequence[Skipped], corrupt_packets: int, ended: str) -> Summary:
-        """The summary so far; ``ended`` says in words why the run ended."""
+    def build(
+        self,
+        skipped: Sequence[Skipped],
+        corrupt_packets: int,
+        ended: str,
+        live: LiveStatus | None = None,
+    ) -> Summary:
+        """The summary so far; ``ended`` says in words why the run ended.
+
+        ``live`` is the status of a live source.
+        """
         counts = self._match_counts
         pairs = sum(matches * times for matches, times in counts.items())
         return Summary(
@@ -353,4 +386,5 @@ class SummaryBuilder:
             skipped=tuple(skipped),
             corrupt_packets=corrupt_packets,
             ended=ended,
+            live=live,
         )

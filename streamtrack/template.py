@@ -22,13 +22,14 @@ _MAX_ENLARGEMENT = 2.0
 _SCALE_STEP = 2**-0.5
 _MIN_PATCH_SIDE_PX = 28
 _FLOW_POINTS = 260
-_MIN_FLOW_POINTS = 12
+MIN_FLOW_POINTS = 12
 _FEW_POINTS = 25
 _EDGE_PX = 9
 _MARGIN_SHARE = 0.06
 _MIN_GRADIENT = 2.0
 """Grey levels per pixel in the weaker direction; noise of sigma 3 gives about 1.3."""
 _FEATURE_BORDER_PX = 48
+_SURROUNDINGS_SHARE = 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,18 +84,22 @@ def make_template(name: str, picture: Image, quad: Points, extractor: FeatureExt
     Raises TargetError if there is too little texture to follow it.
     """
     grey = geometry.grey_of(picture)
-    patches = _make_patches(grey, quad)
-    if not patches or len(patches[0].points) < _MIN_FLOW_POINTS:
+    patches = make_patches(grey, quad)
+    if not patches or len(patches[0].points) < MIN_FLOW_POINTS:
         found = len(patches[0].points) if patches else 0
         raise TargetError(
             f"target '{name}' has too little texture: {found} textured spots, "
-            f"{_MIN_FLOW_POINTS} needed; choose a larger or more structured region"
+            f"{MIN_FLOW_POINTS} needed; choose a larger or more structured region"
         )
     features = _features_inside(grey, quad, extractor)
     return Template(name, picture, quad, patches, features)
 
 
-def _make_patches(grey: Image, quad: Points) -> tuple[Patch, ...]:
+def make_patches(grey: Image, quad: Points, shown: Points | None = None) -> tuple[Patch, ...]:
+    """The target inside ``quad`` of a grey picture (H, W) at all its scales, finest first.
+
+    ``shown`` (N, 2), if given, limits what is compared to the surroundings of these points.
+    """
     x0, y0, x1, y1 = geometry.bounding_box(quad)
     margin = max(2.0, _MARGIN_SHARE * max(x1 - x0, y1 - y0))
     x0, y0, x1, y1 = x0 - margin, y0 - margin, x1 + margin, y1 + margin
@@ -107,16 +112,23 @@ def _make_patches(grey: Image, quad: Points) -> tuple[Patch, ...]:
         if min(size) < _MIN_PATCH_SIDE_PX and patches:
             break
         size = max(size[0], 12), max(size[1], 12)
-        patches.append(_make_patch(pyramid, quad, (x0, y0), scale, size))
+        patches.append(_make_patch(pyramid, quad, shown, (x0, y0), scale, size))
     return tuple(patches)
 
 
 def _make_patch(
-    pyramid: Pyramid, quad: Points, corner: tuple[float, float], scale: float, size: tuple[int, int]
+    pyramid: Pyramid,
+    quad: Points,
+    shown: Points | None,
+    corner: tuple[float, float],
+    scale: float,
+    size: tuple[int, int],
 ) -> Patch:
     patch_from_template = geometry.scaling(scale) @ geometry.translation(-corner[0], -corner[1])
     image = pyramid.warped(geometry.inverted(patch_from_template), size)
     inside = _polygon_mask(geometry.transform_points(patch_from_template, quad), size)
+    if shown is not None:
+        inside &= _surroundings(geometry.transform_points(patch_from_template, shown), size)
     # What lies beyond the target's edge changes as it moves, so points keep away from it.
     kernel = np.ones((_EDGE_PX, _EDGE_PX), np.uint8)
     interior = cv2.erode(inside.astype(np.uint8), kernel) > 0
@@ -143,6 +155,17 @@ def _nearest_rows(points: Points, index: npt.NDArray[np.intp], size: Size) -> np
     row_of_label[labels[lines, columns]] = np.arange(len(points))
     nearest: npt.NDArray[np.intp] = row_of_label[labels.ravel()[index]]
     return nearest
+
+
+def _surroundings(points: Points, size: Size) -> Mask:
+    """Within `_SURROUNDINGS_SHARE` of the patch's longer side from any of the points."""
+    columns, lines = np.rint(points).astype(np.intp).T
+    is_in = (columns >= 0) & (lines >= 0) & (columns < size[0]) & (lines < size[1])
+    near = np.zeros((size[1], size[0]), np.uint8)
+    near[lines[is_in], columns[is_in]] = 1
+    reach = 2 * round(_SURROUNDINGS_SHARE * max(size)) + 1
+    around: Mask = cv2.dilate(near, np.ones((reach, reach), np.uint8)) > 0
+    return around
 
 
 def _polygon_mask(polygon: Points, size: tuple[int, int]) -> Mask:

@@ -39,6 +39,7 @@ from streamtrack.types import (
     TrackState,
     Verdict,
 )
+from streamtrack.views import RecentViews, agreeing_share
 
 _GUIDED_RADIUS_PX = 60.0
 _COAST_FRAMES = 10  # lost frames in which the last pose is still tried
@@ -53,6 +54,10 @@ _CALM_SURPRISE_PX = 2.5
 _CALM_MOTION_PX = 8.0  # a frame: less is hardly smeared
 _SURPRISE_RATE = 0.2  # share of a new frame's surprise in the running mean
 _CLEAR_VIEW_SHARE = 0.5  # inliers of all points, below which a frame teaches no surprise
+_MIN_VIEW_SHARE = 0.6  # of the points of a recent view
+_VIEW_ADVANTAGE = 0.3  # in share of points, of a recent view over the first
+_RENEWED_BELOW_SHARE = 0.75
+_FRAMES_BETWEEN_VIEWS = 4  # after a view that did not help
 _COLOR_REACH_SHARE = 0.04  # of the target's size: how far around a point colours are compared
 
 
@@ -64,6 +69,10 @@ class TargetTracker(Protocol):
 
     def update(self, view: FrameView) -> Track:
         """The target in the next frame."""
+        ...
+
+    def forget_place(self) -> None:
+        """The stream was interrupted: the next frame is searched everywhere."""
         ...
 
 
@@ -82,6 +91,9 @@ class DetectTracker:
         self._was_seen |= found.verdict is Verdict.OK
         return make_track(self.template, found, evidence, "detect", self._was_seen)
 
+    def forget_place(self) -> None:
+        """Every frame is searched everywhere anyway."""
+
 
 class HybridTracker:
     """Predict, warp back, flow against the first frame, gate; features when that fails."""
@@ -92,6 +104,10 @@ class HybridTracker:
         self.template = template
         self._settings = settings
         self._aligner = FlowAligner(template, settings.registration)
+        self._views = RecentViews(template, settings.registration)
+        self._is_in_view = False
+        self._frames_to_next_view = 0
+        self._uses_views = settings.registration.model == "auto"
         self._pose = first_pose
         self._step_pose: Matrix | None = None
         self._frames_lost = 0
@@ -106,8 +122,14 @@ class HybridTracker:
 
     def update(self, view: FrameView) -> Track:
         followed = self._follow(view)
+        recent = self._follow_views(view, followed)
+        if recent is not None:
+            return self._tracked(recent, "view")
         if followed is not None and followed.registration.verdict is Verdict.OK:
+            if agreeing_share(followed) >= _CLEAR_VIEW_SHARE:
+                self._views.remember(view, followed)
             return self._tracked(followed, "flow")
+        self._views.forget()
         if not self._is_searched_in(view):
             return self._not_searched(followed)
         detected, evidence, means = self._detect(view)
@@ -122,6 +144,11 @@ class HybridTracker:
         self._frames_lost += 1
         verdict = detected if followed is None else followed.registration
         return make_track(self.template, verdict, evidence, means, self._was_seen)
+
+    def forget_place(self) -> None:
+        self._pose = self._step_pose = None
+        self._frames_lost = 1
+        self._views.forget()
 
     def _is_searched_in(self, view: FrameView) -> bool:
         """Lost targets take turns between their last place and a search, and keep to the budget."""
@@ -159,6 +186,34 @@ class HybridTracker:
                 if self._doubt_px > _MAX_DOUBT_PX:
                     followed = _refused(followed, Verdict.MOSTLY_HIDDEN)
         return followed if self._frames_lost == 0 else self._with_own_colors(followed, view)
+
+    def _follow_views(self, view: FrameView, followed: Alignment | None) -> Alignment | None:
+        """The pose by how the target looked lately, where the first view does not explain it."""
+        if not self._uses_views or self._pose is None or self._frames_lost or followed is None:
+            return None
+        first_share = agreeing_share(followed)
+        if first_share >= _CLEAR_VIEW_SHARE:
+            self._is_in_view = False
+            self._frames_to_next_view = 0
+            return None
+        if self._frames_to_next_view:
+            self._frames_to_next_view -= 1
+            return None
+        guess = self._pose if self._step_pose is None else self._step_pose @ self._pose
+        recent = self._views.align(view, guess)
+        if recent is None:
+            return None
+        recent = self._with_own_colors(self._plausible(recent, guess), view)
+        share = agreeing_share(recent)
+        needed = _MIN_VIEW_SHARE if self._is_in_view else first_share + _VIEW_ADVANTAGE
+        self._is_in_view = share >= max(_MIN_VIEW_SHARE, needed)
+        if not self._is_in_view:
+            self._frames_to_next_view = _FRAMES_BETWEEN_VIEWS
+            return None
+        self._views.remember(view, recent)
+        if share < _RENEWED_BELOW_SHARE:
+            self._views.renew()
+        return recent
 
     def _is_calm(self, guess: Matrix) -> bool:
         """Is the target's motion, by the last frames, slow and well predicted?"""
@@ -234,7 +289,7 @@ class HybridTracker:
     def _tracked(self, alignment: Alignment, means: str) -> Track:
         found = alignment.registration
         assert found.b_from_a is not None
-        if self._pose is not None and self._frames_lost == 0 and means == "flow":
+        if self._pose is not None and self._frames_lost == 0 and means in ("flow", "view"):
             only_shifts = self._settings.registration.model == "translation"
             model = Model.TRANSLATION if only_shifts else Model.SIMILARITY
             self._step_pose = _shared_motion(model, self.template.quad, self._pose, found.b_from_a)

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 import warnings
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
@@ -480,6 +481,19 @@ def test_log_records_of_all_threads_go_in(tmp_path):
     assert rrd_columns(path, "/log", "TextLog:level")[1] == [["WARN"], ["INFO"]]
 
 
+def test_the_level_of_the_logger_is_given_back(tmp_path):
+    logger = logging.getLogger("streamtrack")
+    before = logger.level
+    first = Recorder(tmp_path / "a.rrd", source(), Settings(), [])
+    second = Recorder(tmp_path / "b.rrd", source(), Settings(), [])
+    first.close()
+    logging.getLogger("streamtrack.sources").info("only the second hears this")
+    second.close()
+    assert rrd_columns(tmp_path / "a.rrd", "/log", "TextLog:text")[1] == []
+    assert len(rrd_columns(tmp_path / "b.rrd", "/log", "TextLog:text")[1]) == 1
+    assert logger.level == before
+
+
 def test_summary_is_replaced_at_the_end(tmp_path):
     path = tmp_path / "summary.rrd"
     recorder = Recorder(path, source(), Settings(), ["board"])
@@ -509,6 +523,41 @@ def test_unwritable_place_is_refused(tmp_path, place):
         for handler in logging.getLogger("streamtrack").handlers
         if type(handler).__module__ == recording.__name__
     ]
+
+
+def test_capture_times_ages_and_epochs_of_a_live_source(tmp_path):
+    path = tmp_path / "live.rrd"
+    began = time.time()
+    with Recorder(path, source(is_live=True), Settings(), []) as recorder:
+        recorder.log_source("connecting")
+        for index in range(4):
+            recorder.log_source("streaming", {"dropped": index // 2, "lost": 0})
+            step = step_of(index, ())
+            captured = began - 100.0 + index
+            frame = replace(step.frame, captured_unix_s=captured, epoch=index // 3)
+            recorder.log(replace(step, frame=frame))
+        recorder.log_source("stalled", time_s=3.5)
+        recorder.log_source("streaming", time_s=9.0)
+    times, ages = rrd_columns(path, "/metrics/age_ms", "Scalars:scalars", "capture_time")
+    np.testing.assert_allclose(np.array(times) / 1e9, began - 100.0 + np.arange(4), atol=1e-4)
+    assert 97e3 <= ages[3][0] <= 127e3
+    states = rrd_columns(path, "/source/state", "StateChange:state")
+    assert states[1] == [["connecting"], ["streaming"], ["stalled"], ["streaming"]]
+    moments = rrd_columns(path, "/source/state", "StateChange:state", "video_time")[0]
+    assert moments == [0, 0, 3_500_000_000, 9_000_000_000]
+    dropped = rrd_columns(path, "/metrics/source/dropped", "Scalars:scalars")
+    assert dropped == ([0, 1], [[0.0], [1.0]])
+    lines = rrd_columns(path, "/log", "TextLog:text")
+    assert lines == ([3], [["frame 3: the source began anew"]])
+
+
+def test_a_file_that_another_run_writes_is_left_alone(tmp_path):
+    path = tmp_path / "run.rrd"
+    with Recorder(path, source(), Settings(), []) as recorder:
+        recorder.log(step_of(0, ()))
+        with pytest.raises(OutputError, match="another process"):
+            Recorder(path, source(), Settings(), [])
+    assert rrd_columns(path, "/camera/image", BLOB)[0] == [0]
 
 
 def test_full_disk_ends_the_recording_but_not_the_run(tmp_path, monkeypatch, caplog):

@@ -479,12 +479,6 @@ def test_a_source_is_read_once_and_closes_its_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("uri", "match"),
     [
-        ("/dev/video0", "live sources are not supported"),
-        ("v4l2:///dev/video0?fps=30", "record to a file first"),
-        ("rtsp://user:secret@host/x", r"^rtsp://host/x: live sources"),
-        ("http://host/x.mp4", "live sources"),
-        ("udp://@:1234", "live sources"),
-        ("-", "live sources"),
         ("ftp://host/x", "unknown kind of source ftp://: known are synthetic://"),
         ("no/such/file.mp4", "no such file"),
         ("no/such/*.png", "no file matches"),

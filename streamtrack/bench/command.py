@@ -64,7 +64,7 @@ def run_request(
         check_plot_path(request.plot_path)
     for path in (request.json_path, request.plot_path):
         if path is not None:
-            _check_writable(path)
+            check_writable(path)
     run = run_bench(scenarios, methods, tell, should_stop)
     report = build_report(run, methods, _options(request))
     if run.trials:
@@ -95,7 +95,7 @@ def _scenarios(request: Request) -> list[Scenario]:
     return result
 
 
-def _check_writable(path: Path) -> None:
+def check_writable(path: Path) -> None:
     """Raise OutputError now rather than when all is measured."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -13,6 +13,8 @@ from typing import Annotated, Any
 import typer
 
 from streamtrack.cli.bench import bench_app
+from streamtrack.cli.devices import devices
+from streamtrack.cli.mosaic import mosaic
 from streamtrack.cli.tools import synth, view
 from streamtrack.cli.track import track
 from streamtrack.errors import StreamtrackError, UsageError
@@ -28,6 +30,8 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 app.command()(track)
+app.command()(mosaic)
+app.command()(devices)
 app.command()(synth)
 app.command()(view)
 app.add_typer(bench_app, name="bench")

@@ -55,3 +55,30 @@ def bench_track(
     request = Request(quick, scenes, seeds, methods, frames, pot, json_path, plot, verbose)
     with warnings_shown(errors, quiet), StopOnSignal() as stop:
         run_request(request, console, (lambda _line: None) if quiet else tell_on(errors), stop)
+
+
+@bench_app.command("mosaic")
+def bench_mosaic(
+    pairs: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of pairs with known homography, to be run as well: img1.png .. with "
+            "H1to2p .., or NAMEA.png, NAMEB.png with NAME_model.txt (B to A)."
+        ),
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="A reduced set, in about a minute.")
+    ] = False,
+    json_path: Annotated[
+        Path | None, typer.Option("--json", help="Everything that was measured, as JSON.")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Tell no progress.")] = False,
+) -> None:
+    """Register pairs of pictures with known truth: every detector and descriptor, and peers."""
+    from streamtrack.bench.command import tell_on
+    from streamtrack.bench.mosaic import PairRequest, run_pair_request
+
+    console, errors = consoles()
+    request = PairRequest(pairs, quick, json_path)
+    with warnings_shown(errors, quiet), StopOnSignal() as stop:
+        run_pair_request(request, console, (lambda _line: None) if quiet else tell_on(errors), stop)

@@ -37,11 +37,14 @@ def merged_settings(path: Path | None, flags: dict[str, Any]) -> Settings:
     return build_settings(values)
 
 
-def default_recording(source: str) -> Path:
+def default_recording(source: str, *, is_series: bool) -> Path:
+    """A free name with the time of start; a series has one name, so that its limits hold."""
     from streamtrack.types import SourceInfo
 
     stem = Path(SourceInfo(source, (0, 0), None, None).name).stem or "source"
     safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in stem)
+    if is_series:
+        return Path("recordings") / f"{safe}.rrd"
     first = Path("recordings") / f"{safe}-{time.strftime('%Y%m%d-%H%M%S')}.rrd"
     path, number = first, 1
     while path.exists():

@@ -26,7 +26,9 @@ def track(
         str,
         typer.Argument(
             metavar="SOURCE",
-            help="Video file, folder or glob of pictures, or synthetic://SCENE?seed=1&frames=300.",
+            help="Video file, folder or glob of pictures, /dev/videoN (see streamtrack devices), "
+            "v4l2://, rtsp://, http(s)://, udp://, - for standard input, or "
+            "synthetic://SCENE?seed=1&frames=300.",
         ),
     ],
     target: Annotated[
@@ -73,6 +75,31 @@ def track(
     video: Annotated[
         Path | None, typer.Option(help="Annotated copy: .mp4, .mkv, .webm, .avi.")
     ] = None,
+    mosaic: Annotated[
+        Path | None,
+        typer.Option(help="What the camera saw, without the targets: .png, .jpg, .tif."),
+    ] = None,
+    live: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[ADDRESS:]PORT",
+            help="Show the run as it goes in a browser or Rerun viewer; 9876 for 127.0.0.1:9876.",
+        ),
+    ] = None,
+    rotate: Annotated[
+        str | None,
+        typer.Option(help="Begin a new recording after 100MB, 10min, or both: 100MB|10min."),
+    ] = None,
+    keep: Annotated[
+        str | None, typer.Option(help="Remove the oldest of them beyond 2GB, 7d, or both.")
+    ] = None,
+    max_fps: Annotated[
+        float | None, typer.Option(help="Leave out pictures of a live source beyond this rate.")
+    ] = None,
+    retries: Annotated[
+        int | None,
+        typer.Option(min=0, help="Openings of a live source in a row; default for ever."),
+    ] = None,
     summary: Annotated[Path | None, typer.Option(help="Summary as JSON.")] = None,
     settings: Annotated[Path | None, typer.Option(help="Settings as TOML; flags win.")] = None,
     start: Annotated[int, typer.Option(min=0, help="First frame, counted from 0.")] = 0,
@@ -88,26 +115,32 @@ def track(
             "registration": {"model": model},
             "tracker": {"method": method, "budget_ms": budget},
             "camera": camera,
-            "recording": {"video": record_video},
+            "recording": {"video": record_video, "rotate": rotate, "keep": keep},
+            "live": {"max_fps": max_fps, "retries": retries},
         },
     )
-    from streamtrack.job import Outputs, TrackJob, run_track
+    from streamtrack.job import TrackJob, run_track
+    from streamtrack.live_server import parse_live
     from streamtrack.targets import parse_targets
+    from streamtrack.watching import Outputs
 
     if no_record and record is not None:
         raise UsageError("--record and --no-record contradict each other: give one of them")
     if not no_record and record is None:
-        record = default_recording(source)
+        record = default_recording(source, is_series=chosen.recording.rotate is not None)
+    address = None if live is None else parse_live(live)
     job = TrackJob(
         source,
         parse_targets(target),
         chosen,
-        Outputs(None if no_record else record, output, poses, video, summary),
+        Outputs(None if no_record else record, output, poses, video, summary, mosaic, address),
         start,
         step,
         frames,
     )
     console, errors = consoles()
+    if address is not None and not quiet:
+        console.print(f"Watch it: {address.page_url}", soft_wrap=True, markup=False)
     with (
         warnings_shown(errors, quiet),
         progress_for(errors, quiet) as progress,

@@ -105,6 +105,7 @@ class MosaicView:
 
     ``preview`` is bounded in size; ``world_from_preview`` maps its pixels to the world.
     ``keyframe_outlines`` (K, 4, 2) and ``frame_outline`` (4, 2) are in world pixels.
+    ``keyframes`` are the K names by which ``edges`` call them, 0 ... K-1 if none are given.
     """
 
     preview: Image
@@ -112,3 +113,4 @@ class MosaicView:
     frame_outline: Points | None
     keyframe_outlines: Points
     edges: tuple[KeyframeEdge, ...] = field(default=())
+    keyframes: tuple[int, ...] = ()

@@ -14,6 +14,14 @@ class CaptureEndedError(SourceError):
     """The device or the peer is gone, or the stream is broken: close it and open it again."""
 
 
+class CaptureFinishedError(CaptureEndedError):
+    """A finished file was read to its end: there is nothing to open again."""
+
+
+class CaptureRefusedError(SourceError):
+    """The peer knows us and does not want us (credentials): trying soon again would not help."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Captured:
     """One picture as a device delivered it.
@@ -21,7 +29,8 @@ class Captured:
     ``time_s`` is on the device's own clock (driver stamp, pts x time base); ``captured_s`` is the
     moment of capture on `time.monotonic`'s clock, as near as the device tells. ``lost`` counts the
     pictures that the device reports lost since the one before, ``damaged`` those that were
-    rejected.
+    rejected, ``dropped`` those that newer ones replaced before they were read, and ``thinned``
+    those that were left out because fewer were asked for.
     """
 
     image: Image
@@ -30,6 +39,8 @@ class Captured:
     lost: int = 0
     damaged: int = 0
     packets: tuple[Packet, ...] = ()
+    dropped: int = 0
+    thinned: int = 0
 
 
 class Capture(Protocol):

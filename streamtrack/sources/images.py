@@ -44,7 +44,7 @@ class ImageSource:
 
     def __init__(self, source: str | Path | Sequence[str | Path]) -> None:
         """Find the pictures and read the first. Raises SourceError if none can be read."""
-        self._paths = _find_pictures(source)
+        self._paths = find_pictures(source)
         self._skipped: list[Skipped] = []
         first, self._first_index = self._first_picture(source)
         self._shape = first.shape
@@ -211,7 +211,8 @@ def _with_channels_of(image: Image, ndim: int) -> Image:
     return np.asarray(cv2.cvtColor(image, code), np.uint8)
 
 
-def _find_pictures(source: str | Path | Sequence[str | Path]) -> list[Path]:
+def find_pictures(source: str | Path | Sequence[str | Path]) -> list[Path]:
+    """The files of a folder or glob in natural order, or a list as it is. Raises SourceError."""
     if not isinstance(source, str | Path):
         if not source:
             raise SourceError("no pictures were given: name at least one")

@@ -1,0 +1,128 @@
+"""`streamtrack mosaic`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from streamtrack.cli.common import (
+    DESCRIPTORS,
+    DETECTORS,
+    StopOnSignal,
+    merged_settings,
+)
+from streamtrack.cli.plain import plain_summary, stage_progress_for, warnings_on_stderr
+from streamtrack.errors import UsageError
+
+if TYPE_CHECKING:
+    from streamtrack.settings import Settings
+
+
+def mosaic(
+    inputs: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="INPUT...",
+            help="Pictures, folders or globs of them; or one stream: video file, /dev/videoN, "
+            "rtsp://..., synthetic://...",
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="The mosaic: .png, .jpg, .tif, .webp or .bmp."),
+    ] = None,
+    detector: Annotated[str | None, typer.Option(help=f"{DETECTORS}.")] = None,
+    threshold: Annotated[float | None, typer.Option(help="The detector's own threshold.")] = None,
+    descriptor: Annotated[str | None, typer.Option(help=f"{DESCRIPTORS}.")] = None,
+    model: Annotated[
+        str | None,
+        typer.Option(help="auto, homography, affine, similarity or translation."),
+    ] = None,
+    warping: Annotated[
+        str | None, typer.Option(help="Backward: nearest, linear, cubic or lanczos.")
+    ] = None,
+    blending: Annotated[
+        str | None, typer.Option(help="none, average, feather or multiband.")
+    ] = None,
+    projection: Annotated[
+        str | None, typer.Option(help="auto, planar, cylindrical or spherical.")
+    ] = None,
+    max_megapixels: Annotated[
+        float | None, typer.Option(help="A larger mosaic is scaled down to this.")
+    ] = None,
+    max_memory: Annotated[
+        float | None, typer.Option(help="MB for pictures and canvas; more goes by way of the disk.")
+    ] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="Text with the true homography, first picture to second: nine numbers."),
+    ] = None,
+    poses: Annotated[Path | None, typer.Option(help="CSV of where each picture lies.")] = None,
+    summary: Annotated[Path | None, typer.Option(help="Summary as JSON.")] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="Recording of a stream's mosaic as it grows (.rrd).")
+    ] = None,
+    no_record: Annotated[bool, typer.Option("--no-record", help="Make no recording.")] = False,
+    settings: Annotated[Path | None, typer.Option(help="Settings as TOML; flags win.")] = None,
+    start: Annotated[int, typer.Option(min=0, help="First frame or picture, from 0.")] = 0,
+    step: Annotated[int, typer.Option(min=1, help="Use every n-th.")] = 1,
+    frames: Annotated[int | None, typer.Option(min=1, help="Use at most n.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
+) -> None:
+    """Join pictures, or the frames of a stream, into one picture, and say how well they fit."""
+    if output is None and poses is None and summary is None and record is None:
+        raise UsageError("nothing would be written: name the mosaic, as in --output mosaic.png")
+    if no_record and record is not None:
+        raise UsageError("--record and --no-record contradict each other: give one of them")
+    chosen = _settings(
+        settings,
+        (detector, threshold, descriptor),
+        model,
+        {
+            "warping": warping,
+            "blending": blending,
+            "projection": projection,
+            "max_megapixels": max_megapixels,
+            "max_memory_mb": max_memory,
+        },
+    )
+    from streamtrack.mosaic.job import MosaicJob, MosaicOutputs, run_mosaic
+
+    job = MosaicJob(
+        tuple(inputs),
+        chosen,
+        MosaicOutputs(output, poses, summary, record),
+        truth,
+        start,
+        step,
+        frames,
+    )
+    with (
+        warnings_on_stderr(quiet),
+        stage_progress_for(quiet) as progress,
+        StopOnSignal() as stop,
+    ):
+        outcome = run_mosaic(job, progress, stop)
+    if not quiet:
+        plain_summary(outcome.summary.rows(), job.outputs.record)
+    if outcome.error is not None:
+        raise outcome.error
+
+
+def _settings(
+    path: Path | None,
+    features: tuple[str | None, float | None, str | None],
+    model: str | None,
+    mosaic_flags: dict[str, str | float | None],
+) -> Settings:
+    names = ("detector", "threshold", "descriptor")
+    return merged_settings(
+        path,
+        {
+            "features": dict(zip(names, features, strict=True)),
+            "registration": {"model": model},
+            "mosaic": mosaic_flags,
+        },
+    )

@@ -1,0 +1,285 @@
+"""Watching a run as it happens: the Rerun viewer on a page, or its own window, over gRPC.
+
+    tracker --Step--> bounded queue (oldest goes) --> thread: small picture, rows, bytes --> pipe
+        --> process of its own (`rerun -`): keeps the last data and serves any number of viewers
+
+The tracker only ever puts a Step into the queue. Whatever viewers do (none, slow, frozen, killed),
+it meets the process and, if that stops reading, the thread; the queue then loses its oldest, and
+a process that does not read for long, ends, or grows too large is started anew.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from types import TracebackType
+from typing import Self
+
+import cv2
+import numpy as np
+import rerun as rr
+import rerun_bindings
+
+from streamtrack import blueprint
+from streamtrack.errors import OutputError
+from streamtrack.geometry import inverted, scaling, transform_points
+from streamtrack.live_server import LiveAddress, LiveServer, ServerError, check_free
+from streamtrack.mosaic.types import MosaicView
+from streamtrack.recorded_file import Layout, new_stream
+from streamtrack.recorded_steps import StepLog
+from streamtrack.recorded_video import Clock, jpeg_video
+from streamtrack.recording import RunLogHandler, timeline_of
+from streamtrack.settings import Settings
+from streamtrack.types import Image, Matrix, Size, SourceInfo, Step, Track
+
+_log = logging.getLogger("streamtrack.live")
+
+_MAX_QUEUE = 8
+_MAX_RATE_HZ = 15.0
+_MAX_SIDE = 640
+_JPEG_QUALITY = 75
+_RESTART_S = (1.0, 60.0)
+_POLL_S = 0.2
+_LAST_LOOK_S = 0.2
+"""Left to the process to hand on what came last, before it is ended."""
+
+
+class LiveView:
+    """Shows each `Step` of a run to whoever connects; takes what a `Recorder` takes.
+
+    Every call returns at once. ``dropped`` counts what was not shown because the viewer's side
+    was too slow; pictures are at most 640 px a side, as JPEG, at most 15 a second. Raises
+    OutputError if the address is taken or there is no viewer to serve.
+    """
+
+    def __init__(
+        self,
+        address: LiveAddress,
+        source: SourceInfo,
+        settings: Settings,
+        target_names: Sequence[str],
+        template_views: Mapping[str, Image] | None = None,
+        has_mosaic: bool = False,
+    ) -> None:
+        self.address = address
+        self.dropped = 0
+        self._factor = min(1.0, _MAX_SIDE / max(source.size_wh))
+        small = {
+            name: _resized(picture, self._factor)
+            for name, picture in (template_views or {}).items()
+        }
+        size_wh = round(source.size_wh[0] * self._factor), round(source.size_wh[1] * self._factor)
+        self._layout = Layout(
+            blueprint.build(size_wh, target_names, timeline_of(source), has_mosaic, source.is_live)
+        )
+        self._stream = new_stream()
+        self._clock = Clock(self._stream, source.is_live)
+        self._run_facts = source, settings, target_names, small
+        self._last_s = 0.0
+        self._last_mosaic_s = 0.0
+        self._waiting: queue.Queue[Callable[[StepLog], object]] = queue.Queue(_MAX_QUEUE)
+        self._end = threading.Event()
+        check_free(address)
+        self._server = LiveServer(address)
+        self._server.start()
+        self._thread = threading.Thread(target=self._run, name="live-view", daemon=True)
+        self._handler = RunLogHandler(self.log_text)
+        self._handler.attach()
+        self._thread.start()
+        try:
+            self._server.wait()
+        except OutputError:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def log(self, step: Step) -> None:
+        """Show all that one frame produced, unless the one before was shown just now."""
+        now = time.monotonic()
+        if now - self._last_s >= 0.9 / _MAX_RATE_HZ:
+            self._last_s = now
+            factor = self._factor
+            self._put(lambda log: log.log(_scaled_step(step, factor)))
+
+    def log_text(self, level: str, message: str) -> None:
+        """Add a line to the log."""
+        self._put(lambda log: log.log_text(level, message))
+
+    def log_source(
+        self, state: str, counts: Mapping[str, int] | None = None, time_s: float | None = None
+    ) -> None:
+        """See `Recorder.log_source`; to be called when the state changes, or now and then."""
+        kept = dict(counts or {})
+        self._put(lambda log: log.log_source(state, kept, time_s))
+
+    def is_mosaic_due(self, time_s: float) -> bool:
+        """See `Recorder.is_mosaic_due`; here by this machine's clock."""
+        return time.monotonic() - self._last_mosaic_s >= 1.0
+
+    def log_mosaic(self, view: MosaicView, index: int, time_s: float) -> None:
+        """See `Recorder.log_mosaic`."""
+        self._last_mosaic_s = time.monotonic()
+
+        def show(log: StepLog) -> None:
+            log.set_time(index, time_s)
+            log.mosaic.log_view(view, time_s)
+
+        self._put(show)
+
+    def log_mosaic_frame(
+        self,
+        index: int,
+        time_s: float,
+        size_wh: Size,
+        world_from_frame: Matrix | None,
+        state: str,
+        reason: str = "",
+        metrics: Mapping[str, float] | None = None,
+    ) -> None:
+        """See `Recorder.log_mosaic_frame`."""
+        kept, pose = dict(metrics or {}), world_from_frame
+        if pose is not None:  # the targets are shown in pixels of the small picture
+            pose = pose @ inverted(scaling(self._factor))
+        small = (round(size_wh[0] * self._factor), round(size_wh[1] * self._factor))
+        self._put(lambda log: log.log_mosaic_frame(index, time_s, small, pose, state, reason, kept))
+
+    def close(self, summary_markdown: str = "") -> None:
+        """Disconnect all viewers, within about two seconds; closing again does nothing."""
+        if self._end.is_set():
+            return
+        self._handler.detach()
+        self._put(lambda log: log.close(summary_markdown))
+        self._end.set()
+        self._thread.join(1.0)
+        self._server.kill()  # should the thread be stuck in writing to it
+        self._thread.join(1.0)
+
+    def _put(self, show: Callable[[StepLog], object]) -> None:
+        """Never blocks: where there is no room the oldest goes."""
+        while not self._end.is_set():
+            try:
+                self._waiting.put_nowait(show)
+            except queue.Full:
+                with contextlib.suppress(queue.Empty):
+                    self._waiting.get_nowait()
+                    self.dropped += 1
+            else:
+                return
+
+    def _run(self) -> None:
+        """Serves until the end; a server that failed is started anew, ever more rarely."""
+        pause_s = _RESTART_S[0]
+        while not self._end.is_set():
+            since = time.monotonic()
+            try:
+                self._serve(self._new_channel())
+            except ServerError as error:
+                if self._end.is_set():
+                    break
+                _log.warning("the live view is started anew: %s", error)
+            self._server.stop()
+            if time.monotonic() - since > _RESTART_S[1]:
+                pause_s = _RESTART_S[0]
+            if self._end.wait(pause_s):
+                break
+            pause_s = min(2.0 * pause_s, _RESTART_S[1])
+            with contextlib.suppress(OSError, OutputError):
+                self._server.start()
+
+    def _new_channel(self) -> _Channel:
+        """All that is said once, for a process that knows nothing yet."""
+        output = rr.binary_stream(recording=self._stream)
+        rerun_bindings.send_blueprint(
+            self._layout.messages(), make_active=True, recording=self._stream.to_native()
+        )
+        log = StepLog(self._stream, self._clock, *self._run_facts)
+        log.video = jpeg_video(self._stream, self._clock, _JPEG_QUALITY)
+        log.begin()
+        channel = _Channel(log, output, self._server)
+        channel.show(lambda _: None)
+        return channel
+
+    def _serve(self, channel: _Channel) -> None:
+        """Hands over what comes. Raises ServerError."""
+        checked_s = time.monotonic()
+        while True:
+            try:
+                show = self._waiting.get(timeout=_POLL_S)
+            except queue.Empty:
+                if self._end.is_set():
+                    time.sleep(_LAST_LOOK_S)
+                    return
+            else:
+                channel.show(show)
+            if (now := time.monotonic()) - checked_s > 1.0:
+                checked_s = now
+                self._server.check()
+
+
+class _Channel:
+    """One stream of a run to one process, complete by itself."""
+
+    def __init__(self, log: StepLog, output: rr.BinaryStream, server: LiveServer) -> None:
+        self._log = log
+        self._output = output
+        self._server = server
+
+    def show(self, show: Callable[[StepLog], object]) -> None:
+        """Raises ServerError if it cannot be handed over."""
+        show(self._log)
+        self._server.write(self._output.read(flush=True) or b"")
+
+
+def _resized(picture: Image, factor: float) -> Image:
+    if factor == 1.0:
+        return picture
+    size = max(1, round(picture.shape[1] * factor)), max(1, round(picture.shape[0] * factor))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _scaled_step(step: Step, factor: float) -> Step:
+    """The step as if frames and target pictures had been given smaller."""
+    if factor == 1.0:
+        return step
+    small_from_full = scaling(factor)
+    features = step.features
+    if features is not None:
+        features = replace(features, points=transform_points(small_from_full, features.points))
+    return replace(
+        step,
+        frame=replace(step.frame, image=_resized(step.frame.image, factor), packets=()),
+        tracks=tuple(_scaled_track(track, small_from_full) for track in step.tracks),
+        features=features,
+    )
+
+
+def _scaled_track(track: Track, small_from_full: Matrix) -> Track:
+    pose, evidence = track.frame_from_template, track.evidence
+    return replace(
+        track,
+        quad=None if track.quad is None else transform_points(small_from_full, track.quad),
+        frame_from_template=(
+            None if pose is None else small_from_full @ pose @ inverted(small_from_full)
+        ),
+        evidence=replace(
+            evidence,
+            template_points=transform_points(small_from_full, evidence.template_points),
+            frame_points=transform_points(small_from_full, evidence.frame_points),
+            unmatched_points=transform_points(small_from_full, evidence.unmatched_points),
+        ),
+    )

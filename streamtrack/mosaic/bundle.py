@@ -1,0 +1,400 @@
+"""Levenberg-Marquardt over the poses of a mosaic's pictures, for one transformation model.
+
+Poses ``world_from_picture`` move by small changes on their right, W <- W N^-1 (I + D) N, where N
+maps the picture to unit coordinates and D spans the model's freedoms. The normal equations are
+built block by block with analytic Jacobians and are as sparse as the graph of links.
+
+Wrong links are found by graduated non-convexity (Yang et al. 2020, "Graduated non-convexity for
+robust spatial perception", the Geman-McClure case) on each link's RMS; the pairs of the others
+are weighted by Huber's function.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from streamtrack.types import Mask, Model
+
+Doubles: TypeAlias = npt.NDArray[np.float64]
+Rows: TypeAlias = npt.NDArray[np.intp]
+
+_MAX_ROUNDS = 30
+_CONVERGED_PX = 5e-3
+MIN_NOISE_PX = 0.05
+_MIN_TOLERANCE_PX = 1.0  # links are never wrong for less than three times this
+_HUBER = 1.345  # times the noise: 95 % efficient for Gaussian errors
+_DENSE_UNKNOWNS = 240
+_PRIOR_FLOOR = 1e-5
+_DAMPING = 1e-9
+_MAX_DAMPING = 1e3
+
+# Columns: changes D of a pose, rows h11 .. h32 of D, that a model allows.
+_FREEDOMS: dict[Model, Doubles] = {
+    Model.TRANSLATION: np.eye(8)[:, [2, 5]],
+    Model.SIMILARITY: np.stack(
+        [np.eye(8)[2], np.eye(8)[5], np.eye(8)[0] + np.eye(8)[4], np.eye(8)[3] - np.eye(8)[1]],
+        axis=1,
+    ),
+    Model.AFFINE: np.eye(8)[:, :6],
+    Model.HOMOGRAPHY: np.eye(8),
+}
+# Rows: how the four measures of `_deviations` change with D.
+_DEVIATION_ROWS = np.zeros((4, 8))
+_DEVIATION_ROWS[0, [0, 4]] = 1.0, -1.0
+_DEVIATION_ROWS[1, [1, 3]] = 1.0
+_DEVIATION_ROWS[2, 6] = _DEVIATION_ROWS[3, 7] = 1.0
+_SIMILARITY_ROWS = np.linalg.pinv(_FREEDOMS[Model.SIMILARITY])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """Links as padded arrays; every link is there twice, with half of its pairs each way.
+
+    a, b                int (2 L,), rows of the pictures: points of a are mapped into b
+    a_points, b_points  (2 L, K, 2), zero where there is no pair
+    counts              float (2 L, K), how many of the link's own pairs each stands for
+    unit_from_picture   (n, 3, 3)
+    unit_px             (n,), picture pixels of one unit
+    is_held             bool (n,), poses that do not move
+    anchor              row of the anchor, None if held pictures fix the world
+    own                 (2 L, 3, 3), b_from_a as the links themselves have it
+    """
+
+    a: Rows
+    b: Rows
+    a_points: Doubles
+    b_points: Doubles
+    counts: Doubles
+    unit_from_picture: Doubles
+    unit_px: Doubles
+    is_held: Mask
+    anchor: int | None
+    own: Doubles
+
+    @property
+    def links(self) -> int:
+        return len(self.a) // 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Poses (n, 3, 3) of a model; ``errors_px`` (2 L, K) of all pairs, ``is_used`` (L,)."""
+
+    poses: Doubles
+    model: Model
+    errors_px: Doubles
+    counts: Doubles
+    is_used: Mask
+    noise_px: float
+
+    def cost(self, noise_px: float) -> float:
+        """Bounded sum of squares over all pairs, in units of the noise."""
+        squares = np.minimum(self.errors_px**2 * self.counts / noise_px**2, 9.0)
+        return float(np.sum(squares))
+
+
+def _of_links(values: Doubles) -> Doubles:
+    """Sums (L,) of what the two halves (2 L,) of each link have."""
+    half = len(values) // 2
+    total: Doubles = values[:half] + values[half:]
+    return total
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Weights:
+    """What each pair (2 L, K) counts, a square pixel's worth, and the prior's precisions (4,)."""
+
+    pairs: Doubles
+    prior: Doubles
+
+
+def solve(
+    problem: Problem,
+    start: Doubles,
+    model: Model,
+    is_graduated: bool = True,
+    rounds: int = _MAX_ROUNDS,
+) -> Solution:
+    """Levenberg-Marquardt from ``start``, reweighted at each of at most ``rounds`` rounds.
+
+    ``is_graduated`` lets all links count at first; else the start tells good links from wrong.
+    """
+    poses, errors = start, _errors(problem, start)
+    damping, rejection = _DAMPING, _Rejection(problem, errors, is_graduated)
+    for tried in range(rounds):
+        weights = _weights(problem, poses, errors, rejection)
+        before = _cost(problem, weights, poses, errors, model)
+        while True:
+            change = _step(problem, poses, weights, model, damping)
+            moved = _moved(problem, poses, change)
+            moved_errors = _errors(problem, moved)
+            if _cost(problem, weights, moved, moved_errors, model) <= before:
+                break
+            damping *= 10
+            if damping > _MAX_DAMPING:
+                return _finished(problem, poses, errors, rejection, model)
+        damping = max(damping / 10, _DAMPING)
+        moved_px = float(np.max(np.abs(change) * problem.unit_px[:, None]))
+        poses, errors = moved, moved_errors
+        is_final = rejection.tighten(errors)
+        if moved_px < _CONVERGED_PX and is_final and tried > 2:
+            break
+    return _finished(problem, poses, errors, rejection, model)
+
+
+def _finished(
+    problem: Problem, poses: Doubles, errors: Doubles, rejection: _Rejection, model: Model
+) -> Solution:
+    is_used = rejection.is_used(errors)
+    noise_px = estimated_noise_px(problem, errors, is_used)
+    return Solution(poses, model, np.minimum(errors, 1e6), problem.counts, is_used, noise_px)
+
+
+class _Rejection:
+    """Weights of whole links by graduated non-convexity: first all count, then those that agree."""
+
+    def __init__(self, problem: Problem, errors: Doubles, is_graduated: bool) -> None:
+        self._counts = problem.counts
+        self._pairs = np.maximum(_of_links(problem.counts.sum(axis=1)), 1)
+        worst, tolerance = float(np.max(self._rms(errors))), self._tolerance(errors)
+        self._mu = max(1.0, 2 * (worst / tolerance) ** 2) if is_graduated else 1.0
+
+    def _rms(self, errors: Doubles) -> Doubles:
+        squares = self._counts * np.minimum(errors, 1e6) ** 2
+        rms: Doubles = np.sqrt(_of_links(squares.sum(axis=1)) / self._pairs)
+        return rms
+
+    def _tolerance(self, errors: Doubles) -> float:
+        """RMS of a link that counts half: three times what links usually have."""
+        return 3 * max(_MIN_TOLERANCE_PX, float(np.median(self._rms(errors))))
+
+    def weights(self, errors: Doubles) -> Doubles:
+        """What each link (L,) counts, 0..1."""
+        slack = self._mu * self._tolerance(errors) ** 2
+        weights: Doubles = (slack / (self._rms(errors) ** 2 + slack)) ** 2
+        return weights
+
+    def tighten(self, errors: Doubles) -> bool:
+        """Go on to the next, less convex stage; True if there is none."""
+        is_final = self._mu <= 1.0
+        self._mu = max(1.0, self._mu / 4.0)
+        return is_final
+
+    def is_used(self, errors: Doubles) -> Mask:
+        used: Mask = self._rms(errors) <= self._tolerance(errors)
+        return used
+
+
+def estimated_noise_px(problem: Problem, errors: Doubles, is_used: Mask | None = None) -> float:
+    """Standard deviation a coordinate of one pair's error, from the median length."""
+    is_pair = problem.counts > 0
+    if is_used is not None:
+        is_pair = is_pair & np.concatenate([is_used, is_used])[:, None]
+    if not is_pair.any():
+        return MIN_NOISE_PX
+    alone = errors[is_pair] * np.sqrt(problem.counts[is_pair])
+    return max(MIN_NOISE_PX, float(np.median(alone)) / 1.1774)
+
+
+def _weights(problem: Problem, poses: Doubles, errors: Doubles, rejection: _Rejection) -> _Weights:
+    noise_px = estimated_noise_px(problem, errors)
+    # The mean of n pairs is worth n of them, as far as their errors are independent.
+    alone = errors * np.sqrt(problem.counts)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        huber = np.nan_to_num(np.minimum(1.0, 2 * _HUBER * noise_px / alone))
+    of_link = rejection.weights(errors)
+    pairs = huber * problem.counts * np.concatenate([of_link, of_link])[:, None] / noise_px**2
+    absolute = _variances(poses, problem.unit_from_picture)
+    relative = _variances(problem.own, problem.unit_from_picture[problem.a])
+    return _Weights(pairs, 1 / (np.maximum(absolute, relative) + _PRIOR_FLOOR**2))
+
+
+def _variances(poses: Doubles, unit_from_picture: Doubles) -> Doubles:
+    """Mean squares (4,) of what poses have beyond similarities, the farthest tenth left out.
+
+    Both measures of a kind get one: a camera turned by 90 degrees is no other camera.
+    """
+    squares = _deviations(poses, unit_from_picture) ** 2
+    kept = np.sort(squares, axis=0)[: max(1, round(0.9 * len(squares)))]
+    variances = kept.mean(axis=0)
+    return np.repeat([np.mean(variances[:2]), np.mean(variances[2:])], 2)
+
+
+def _cost(
+    problem: Problem, weights: _Weights, poses: Doubles, errors: Doubles, model: Model
+) -> float:
+    is_counted = weights.pairs > 0
+    cost = float(np.sum(weights.pairs[is_counted] * errors[is_counted] ** 2))
+    if model in (Model.AFFINE, Model.HOMOGRAPHY):
+        cost += float(np.sum(_deviations(poses, problem.unit_from_picture) ** 2 * weights.prior))
+    return cost if np.isfinite(cost) else float("inf")
+
+
+def _deviations(poses: Doubles, unit_from_picture: Doubles) -> Doubles:
+    """What each pose (n, 4) has beyond a similarity: aspect, shear, and perspective along x and y.
+
+    In unit coordinates, at the picture's centre.
+    """
+    local = poses @ np.linalg.inv(unit_from_picture)
+    corner = local[:, 2, 2]
+    linear = local[:, :2, :2] / corner[:, None, None]
+    linear = linear - local[:, :2, 2:] * local[:, 2:, :2] / corner[:, None, None] ** 2
+    metric = linear.transpose(0, 2, 1) @ linear
+    trace = metric[:, 0, 0] + metric[:, 1, 1]
+    aspect = (metric[:, 0, 0] - metric[:, 1, 1]) / trace
+    shear = 2 * metric[:, 0, 1] / trace
+    bend = local[:, 2, :2] / corner[:, None]
+    return np.stack([aspect, shear, bend[:, 0], bend[:, 1]], axis=1)
+
+
+def _relative(problem: Problem, poses: Doubles) -> Doubles:
+    """b_from_a (2 L, 3, 3) that the poses imply for the links."""
+    return np.asarray(np.linalg.inv(poses)[problem.b] @ poses[problem.a], np.float64)
+
+
+def _mapped(problem: Problem, b_from_a: Doubles) -> tuple[Doubles, Doubles]:
+    """Points of a in b (2 L, K, 2), and their depths (2 L, K)."""
+    homogeneous = problem.a_points @ b_from_a[:, :, :2].transpose(0, 2, 1) + b_from_a[:, None, :, 2]
+    depth = homogeneous[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return homogeneous[..., :2] / depth[..., None], depth
+
+
+def _errors(problem: Problem, poses: Doubles) -> Doubles:
+    """Distance (2 L, K) of each mapped point from its partner; inf behind the horizon."""
+    return transfer_errors_of(problem, _relative(problem, poses))
+
+
+def transfer_errors_of(problem: Problem, b_from_a: Doubles) -> Doubles:
+    mapped, depth = _mapped(problem, b_from_a)
+    errors = np.hypot(*np.moveaxis(mapped - problem.b_points, -1, 0))
+    # Depths keep the sign they have at a's centre as long as no point folds over.
+    centre = np.linalg.inv(problem.unit_from_picture[problem.a])[:, :, 2]
+    sign = np.sign(np.einsum("li,li->l", b_from_a[:, 2], centre))
+    errors[~np.isfinite(errors) | (depth * sign[:, None] <= 0)] = np.inf
+    return np.asarray(errors, np.float64)
+
+
+def _jacobians(problem: Problem, poses: Doubles, model: Model) -> tuple[Doubles, Doubles, Doubles]:
+    """Residuals b - mapped (2 L, K, 2), and how mapped points change with both poses' freedoms."""
+    freedoms = _FREEDOMS[model]
+    b_from_a = _relative(problem, poses)
+    mapped, depth = _mapped(problem, b_from_a)
+    residuals = problem.b_points - mapped
+    unit_a, unit_b = problem.unit_from_picture[problem.a], problem.unit_from_picture[problem.b]
+
+    # d mapped = d pi(h) B^-1 A N^-1 (D N p), with (D N p) linear in D's elements.
+    b_from_unit = b_from_a @ np.linalg.inv(unit_a)
+    change = b_from_unit[:, None, :2] - mapped[..., None] * b_from_unit[:, None, 2:]
+    change = change / depth[..., None, None]
+    x, y = np.moveaxis(
+        problem.a_points * unit_a[:, None, [0, 1], [0, 1]] + unit_a[:, None, :2, 2], -1, 0
+    )
+    ray = np.stack([x, y, np.ones_like(x)], axis=-1)
+    by_a = (change[..., :, None] * ray[..., None, None, :]).reshape(*change.shape[:-1], 9)[..., :8]
+
+    # B's change stands inverted before the mapped point: -d pi at the point itself.
+    factor = unit_b[:, 0, 0]
+    u, v = np.moveaxis(mapped * factor[:, None, None] + unit_b[:, None, :2, 2], -1, 0)
+    one, zero = np.ones_like(u), np.zeros_like(u)
+    rows_u = np.stack([u, v, one, zero, zero, zero, -u * u, -u * v], axis=-1)
+    rows_v = np.stack([zero, zero, zero, u, v, one, -u * v, -v * v], axis=-1)
+    by_b = -np.stack([rows_u, rows_v], axis=-2) / factor[:, None, None, None]
+    return residuals, by_a @ freedoms, by_b @ freedoms
+
+
+def _step(
+    problem: Problem, poses: Doubles, weights: _Weights, model: Model, damping: float
+) -> Doubles:
+    """The change D (n, 8) of every pose that minimises the linearised cost."""
+    freedoms = _FREEDOMS[model]
+    k, count = freedoms.shape[1], len(poses)
+    residuals, by_a, by_b = _jacobians(problem, poses, model)
+    links, pairs = problem.counts.shape
+    root = np.sqrt(weights.pairs)
+    is_counted = root > 0
+    root = np.where(is_counted, root, 0.0)
+
+    def rows(values: Doubles) -> Doubles:
+        scaled = np.where(is_counted[..., None, None], values, 0.0) * root[..., None, None]
+        return scaled.reshape(links, 2 * pairs, -1)
+
+    ja, jb, r = rows(by_a), rows(by_b), rows(residuals[..., None])
+    ja_t, jb_t = ja.transpose(0, 2, 1), jb.transpose(0, 2, 1)
+    diagonal, vector = np.zeros((count, k, k)), np.zeros((count, k))
+    np.add.at(diagonal, problem.a, ja_t @ ja)
+    np.add.at(diagonal, problem.b, jb_t @ jb)
+    np.add.at(vector, problem.a, (ja_t @ r)[..., 0])
+    np.add.at(vector, problem.b, (jb_t @ r)[..., 0])
+    if model in (Model.AFFINE, Model.HOMOGRAPHY):
+        prior = _DEVIATION_ROWS @ freedoms
+        diagonal += prior.T @ (weights.prior[:, None] * prior)
+        vector -= (_deviations(poses, problem.unit_from_picture) * weights.prior) @ prior
+    if problem.anchor is not None:
+        pin = _SIMILARITY_ROWS @ freedoms
+        strength = 1e3 * max(1.0, float(np.max(diagonal)))
+        diagonal[problem.anchor] += strength * pin.T @ pin
+    diagonal[:, range(k), range(k)] *= 1 + damping
+    diagonal[:, range(k), range(k)] += 1e-9
+
+    is_free = ~problem.is_held
+    place = np.where(is_free, np.cumsum(is_free) - 1, -1)
+    row, column = place[problem.a], place[problem.b]
+    is_between = (row >= 0) & (column >= 0)
+    blocks = (ja_t @ jb)[is_between]
+    normal = _Normal(diagonal[is_free], row[is_between], column[is_between], blocks)
+    change = np.zeros((count, 8))
+    change[is_free] = _solved(normal, vector[is_free]) @ freedoms.T
+    return change
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Normal:
+    """A symmetric matrix of k x k blocks: (n, k, k) on its diagonal, (m, k, k) at (row, column).
+
+    Blocks at the same place add up, and each stands transposed at (column, row) too.
+    """
+
+    diagonal: Doubles
+    row: Rows
+    column: Rows
+    blocks: Doubles
+
+
+def _solved(normal: _Normal, vector: Doubles) -> Doubles:
+    """Solution (n, k) of ``normal`` times it = ``vector`` (n, k)."""
+    count, k = vector.shape
+    every = np.arange(count)
+    row = np.concatenate([every, normal.row, normal.column])
+    column = np.concatenate([every, normal.column, normal.row])
+    blocks = np.concatenate([normal.diagonal, normal.blocks, normal.blocks.transpose(0, 2, 1)])
+    if count * k <= _DENSE_UNKNOWNS:
+        dense = np.zeros((count, count, k, k))
+        np.add.at(dense, (row, column), blocks)
+        square = dense.transpose(0, 2, 1, 3).reshape(count * k, count * k)
+        return np.asarray(np.linalg.solve(square, vector.ravel()), np.float64).reshape(count, k)
+    from scipy.sparse import coo_array
+    from scipy.sparse.linalg import splu
+
+    shape = blocks.shape
+    inner = np.arange(k)
+    rows = np.broadcast_to(row[:, None, None] * k + inner[:, None], shape).ravel()
+    columns = np.broadcast_to(column[:, None, None] * k + inner, shape).ravel()
+    square = coo_array((blocks.ravel(), (rows, columns)), shape=(count * k, count * k)).tocsc()
+    factors = splu(square, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    return np.asarray(factors.solve(vector.ravel()), np.float64).reshape(count, k)
+
+
+def _moved(problem: Problem, poses: Doubles, change: Doubles) -> Doubles:
+    """Poses after W <- W N^-1 (I + D) N, scaled so that their last element is 1."""
+    last = np.zeros((len(change), 1))
+    step = np.eye(3) + np.concatenate([change, last], axis=1).reshape(-1, 3, 3)
+    unit = problem.unit_from_picture
+    moved = poses @ np.linalg.inv(unit) @ step @ unit
+    moved[problem.is_held] = poses[problem.is_held]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(moved / moved[:, 2:, 2:], np.float64)

@@ -1,0 +1,89 @@
+"""Which parts of the world were seen how often, and when: small square cells, sparse."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from streamtrack import geometry
+from streamtrack.types import Mask, Matrix, Size
+
+_BLOCK = 64
+Values: TypeAlias = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Footprint:
+    """The cells that a frame sees: ``seen`` (rows, columns) from cell (x, y) on."""
+
+    x: int
+    y: int
+    seen: Mask
+
+    @property
+    def count(self) -> int:
+        return int(np.count_nonzero(self.seen))
+
+
+def footprint(world_from_frame: Matrix, size_wh: Size, cell_px: float) -> Footprint:
+    """The cells whose centres lie inside a frame. ``cell_px`` is their side in world pixels."""
+    quad = geometry.transform_points(world_from_frame, geometry.image_quad(size_wh))
+    x0, y0, x1, y1 = (int(np.floor(v / cell_px)) for v in geometry.bounding_box(quad))
+    columns, rows = np.arange(x0, x1 + 1), np.arange(y0, y1 + 1)
+    x, y = np.meshgrid((columns + 0.5) * cell_px, (rows + 0.5) * cell_px)
+    a, b = quad.astype(np.float64), np.roll(quad, -1, axis=0).astype(np.float64)
+    seen = np.ones(x.shape, np.bool_)
+    for (ax, ay), (bx, by) in zip(a, b, strict=True):  # clockwise: inside is to the right
+        seen &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= 0
+    return Footprint(x0, y0, seen)
+
+
+class CellGrid:
+    """Whole numbers by cell, 0 where nothing was written; grows in all directions."""
+
+    def __init__(self) -> None:
+        self._blocks: dict[tuple[int, int], Values] = {}
+
+    def read(self, where: Footprint) -> Values:
+        """The values under a footprint's rectangle (rows, columns), a copy."""
+        values = np.zeros(where.seen.shape, np.int32)
+        for key, there, here in _parts(where):
+            if key in self._blocks:
+                values[here] = self._blocks[key][there]
+        return values
+
+    def write(self, where: Footprint, values: Values) -> None:
+        """Set the values of the cells that the footprint sees."""
+        for key, there, here in _parts(where):
+            seen = where.seen[here]
+            if seen.any():
+                block = self._blocks.setdefault(key, np.zeros((_BLOCK, _BLOCK), np.int32))
+                block[there][seen] = values[here][seen]
+
+    def add(self, where: Footprint, amount: int) -> None:
+        """Add to the cells that the footprint sees."""
+        self.write(where, self.read(where) + np.int32(amount))
+
+
+Part: TypeAlias = tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]
+
+
+def _parts(where: Footprint) -> list[Part]:
+    """Key of each block that is touched, and the common part in the block and in the footprint."""
+    rows, columns = where.seen.shape
+    parts: list[Part] = []
+    for by in range(where.y // _BLOCK, (where.y + rows - 1) // _BLOCK + 1):
+        for bx in range(where.x // _BLOCK, (where.x + columns - 1) // _BLOCK + 1):
+            x0, y0 = max(where.x, bx * _BLOCK), max(where.y, by * _BLOCK)
+            x1 = min(where.x + columns, (bx + 1) * _BLOCK)
+            y1 = min(where.y + rows, (by + 1) * _BLOCK)
+            there = (
+                slice(y0 - by * _BLOCK, y1 - by * _BLOCK),
+                slice(x0 - bx * _BLOCK, x1 - bx * _BLOCK),
+            )
+            here = slice(y0 - where.y, y1 - where.y), slice(x0 - where.x, x1 - where.x)
+            parts.append(((bx, by), there, here))
+    return parts

@@ -1,0 +1,252 @@
+"""Painting one frame into a canvas: only its own box is warped, only what is better is replaced.
+
+Each frame carries a weight that falls from its centre to nothing at its edge; every pixel of the
+canvas belongs to the frame that is heaviest there (a Voronoi partition of the frames' centres),
+with a feather a few pixels wide at the borders. Where a frame and the canvas show different
+things, what stands stays (first come, first kept) until re-rendering has samples enough to judge.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from streamtrack import geometry
+from streamtrack.mosaic.tiles import Box
+from streamtrack.types import Image, Matrix, Points, Size, Track
+
+MOST_AREA = 4.0
+"""A frame whose warped box has more than this many times its area is not painted."""
+
+LEAST_WEIGHT = 8
+"""Weight of a frame at its very edge; whatever is lighter after warping lies beyond it."""
+
+FEATHER = 6
+"""Weight levels (of 255) over which one frame fades into another."""
+
+_EDGE_PX = 12.0
+_LEAST_AREA = 16.0
+_TARGET_MARGIN = 0.08
+_SHRINK = 4
+_NOISE_LEVELS = 22.0
+_KERNEL_3, _KERNEL_5, _KERNEL_9 = (np.ones((side, side), np.uint8) for side in (3, 5, 9))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patch:
+    """Pixels (H, W, 4), blue, green, red and weight, and where in the canvas they belong."""
+
+    box: Box
+    pixels: Image
+
+
+def refusal(canvas_from_frame: Matrix, size_wh: Size, extent: float) -> str:
+    """Why a frame cannot be painted so, or an empty string.
+
+    ``extent`` is how far from the origin, in pixels, a canvas may reach.
+    """
+    quad = geometry.image_quad(size_wh)
+    if not np.isfinite(canvas_from_frame).all():
+        return "its pose is not finite"
+    depths = geometry.projective_depths(canvas_from_frame, quad)
+    if not (np.all(depths > 0) or np.all(depths < 0)):
+        return "it would fold over the horizon"
+    warped = geometry.transform_points(canvas_from_frame, quad)
+    x0, y0, x1, y1 = geometry.bounding_box(warped)
+    if abs(geometry.signed_area(warped)) < _LEAST_AREA:
+        return "it would shrink to nothing"
+    if not geometry.is_convex(warped) or geometry.signed_area(warped) <= 0:
+        return "it would be mirrored or folded"
+    times = (x1 - x0) * (y1 - y0) / max(1, (size_wh[0] - 1) * (size_wh[1] - 1))
+    if times > MOST_AREA:
+        return f"its warped box would have {times:.1f} times its area ({MOST_AREA:g} at most)"
+    if max(abs(x0), abs(y0), abs(x1), abs(y1)) > extent:
+        return f"it lies more than {extent:.0f} px from the origin"
+    return ""
+
+
+@lru_cache(maxsize=4)
+def centre_weight(size_wh: Size) -> Image:
+    """Weight (H, W) uint8: 255 at the centre, falling with the distance.
+
+    Over the last few pixels it falls to `LEAST_WEIGHT`, so that no frame ends in a hard edge.
+    """
+    width, height = size_wh
+    x = np.abs(np.arange(width) - (width - 1) / 2)[None, :]
+    y = np.abs(np.arange(height) - (height - 1) / 2)[:, None]
+    radius = math.hypot(width / 2, height / 2)
+    fall = 1.0 - 0.9 * np.hypot(x, y) / radius
+    to_edge = np.minimum((width - 1) / 2 - x, (height - 1) / 2 - y)
+    ramp = min(_EDGE_PX, min(size_wh) / 8)
+    weight = 255.0 * fall * np.clip(to_edge / max(ramp, 1.0), 0.0, 1.0)
+    least: Image = np.maximum(np.rint(weight), LEAST_WEIGHT).astype(np.uint8)
+    least.setflags(write=False)
+    return least
+
+
+def target_quads(tracks: Sequence[Track]) -> tuple[Points, ...]:
+    """The targets' quads, a little larger, for what is on them does not belong to the ground."""
+    quads = []
+    for track in tracks:
+        if track.quad is not None and np.isfinite(track.quad).all():
+            centre = track.quad.mean(axis=0)
+            grown = centre + (track.quad - centre) * (1 + _TARGET_MARGIN)
+            quads.append(np.asarray(grown, np.float32))
+    return tuple(quads)
+
+
+def weighted(image: Image, quads: Sequence[Points] = (), scale: float = 1.0) -> Image:
+    """A frame at ``scale`` as BGRW pixels (H, W, 4), weightless inside the quads (frame px)."""
+    bgr = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image
+    if scale != 1.0:
+        size_wh = scaled_size((image.shape[1], image.shape[0]), scale)
+        method = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+        bgr = cv2.resize(bgr, size_wh, interpolation=method)
+    weight = centre_weight((bgr.shape[1], bgr.shape[0]))
+    if quads:
+        weight = weight.copy()
+        to_scale = geometry.scaling(bgr.shape[1] / image.shape[1], bgr.shape[0] / image.shape[0])
+        for quad in quads:
+            inside = np.clip(geometry.transform_points(to_scale, quad), -(2**14), 2**14)
+            cv2.fillPoly(weight, [np.rint(inside).astype(np.int32)], 0)
+    return np.asarray(cv2.merge([*cv2.split(bgr), weight]), np.uint8)
+
+
+def scaled_size(size_wh: Size, scale: float) -> Size:
+    """A size in whole pixels at a scale, at least 1x1."""
+    return max(1, round(size_wh[0] * scale)), max(1, round(size_wh[1] * scale))
+
+
+def box_of(canvas_from_frame: Matrix, size_wh: Size) -> Box:
+    """The pixels of the canvas that a frame can touch, in whole blocks of 4 x 4."""
+    quad = geometry.transform_points(canvas_from_frame, geometry.image_quad(size_wh))
+    x0, y0, x1, y1 = (value / _SHRINK for value in geometry.bounding_box(quad))
+    left, top = math.floor(x0) * _SHRINK, math.floor(y0) * _SHRINK
+    return left, top, (math.floor(x1) + 1) * _SHRINK, (math.floor(y1) + 1) * _SHRINK
+
+
+def warped(
+    pixels: Image, canvas_from_pixels: Matrix, box: Box, flags: int = cv2.INTER_LINEAR
+) -> Image:
+    """BGRW pixels as seen in a box of the canvas; weightless outside the frame."""
+    into_box = geometry.translation(-box[0], -box[1]) @ canvas_from_pixels
+    size = box[2] - box[0], box[3] - box[1]
+    result = cv2.warpPerspective(pixels, into_box, size, flags=flags)
+    # Beyond the edge colours and weight fall to 0 together: such mixtures with black are left out.
+    weight = cv2.extractChannel(result, 3)
+    weight = cv2.threshold(weight, LEAST_WEIGHT - 1, 0, cv2.THRESH_TOZERO)[1]
+    return np.asarray(cv2.insertChannel(weight, result, 3), np.uint8)
+
+
+def with_gain(pixels: Image, log_gain: npt.NDArray[np.float64]) -> Image:
+    """BGRW pixels with each colour multiplied by exp(log_gain), the weight untouched."""
+    if np.max(np.abs(log_gain)) < 0.004:
+        return pixels
+    *colours, weight = cv2.split(pixels)
+    factors = np.exp(log_gain)
+    brighter = [
+        cv2.convertScaleAbs(c, alpha=float(f)) for c, f in zip(colours, factors, strict=True)
+    ]
+    return np.asarray(cv2.merge([*brighter, weight]), np.uint8)
+
+
+def quartered(pixels: Image) -> Image:
+    """A picture at a quarter of its size, which must be a multiple of 4; each pixel a mean."""
+    half = pixels
+    for _ in range(2):  # Halving twice is seven times as fast as quartering at once.
+        size = half.shape[1] // 2, half.shape[0] // 2
+        half = np.asarray(cv2.resize(half, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return half
+
+
+def disagreement(small_old: Image, small_new: Image) -> Image:
+    """Where two BGRW pictures of one place, at a quarter of their size, show different things.
+
+    255 where the colours, averaged over about 12 px, differ by more than noise and the structure
+    itself (a quarter of its local range: edges that are half a pixel off are no objects) explain.
+    """
+    both = cv2.min(cv2.extractChannel(small_old, 3), cv2.extractChannel(small_new, 3))
+    b, g, r, _ = cv2.split(cv2.blur(cv2.absdiff(small_old, small_new), (3, 3)))
+    worst = cv2.max(cv2.max(b, g), r)
+    worst = cv2.min(worst, cv2.threshold(both, 0, 255, cv2.THRESH_BINARY)[1])
+    found = cv2.inRange(worst, _NOISE_LEVELS, 255)
+    if not cv2.countNonZero(found):
+        return np.asarray(found, np.uint8)
+    grey = cv2.cvtColor(small_old, cv2.COLOR_BGRA2GRAY)
+    spread = cv2.morphologyEx(grey, cv2.MORPH_GRADIENT, _KERNEL_3)
+    excess = cv2.subtract(worst, cv2.convertScaleAbs(spread, alpha=0.25, beta=_NOISE_LEVELS))
+    found = cv2.threshold(excess, 0, 255, cv2.THRESH_BINARY)[1]
+    found = cv2.morphologyEx(found, cv2.MORPH_OPEN, _KERNEL_3)
+    if cv2.countNonZero(found):
+        # A thing is as bright as what it hides here and there: close the gaps in it.
+        found = cv2.dilate(cv2.morphologyEx(found, cv2.MORPH_CLOSE, _KERNEL_9), _KERNEL_5)
+    return np.asarray(found, np.uint8)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Painted:
+    """What painting a frame changed: ``patch`` is None if nothing did.
+
+    ``overlap`` pixels had been painted before; ``differs`` says, at a quarter of the size of the
+    box that was given, where the frame shows something else there (None: nowhere).
+    """
+
+    patch: Patch | None
+    overlap: int
+    contested: int
+    differs: Image | None
+
+
+def paint(old: Patch, new: Image) -> Painted:
+    """Paint ``new`` (BGRW, of the same box) over the canvas pixels ``old``; neither is changed."""
+    old_weight = np.asarray(cv2.extractChannel(old.pixels, 3), np.uint8)
+    new_weight = np.asarray(cv2.extractChannel(new, 3), np.uint8)
+    is_empty = cv2.inRange(old_weight, 0, 0)
+    is_new = cv2.inRange(new_weight, 1, 255)
+    overlap = cv2.countNonZero(is_new) - cv2.countNonZero(cv2.bitwise_and(is_new, is_empty))
+    slope = 128.0 / FEATHER
+    lead = cv2.addWeighted(new_weight, slope, old_weight, -slope, 128.0)
+    contested, differs = 0, None
+    if overlap:
+        differs = disagreement(quartered(old.pixels), quartered(new))
+        contested = cv2.countNonZero(differs) * _SHRINK * _SHRINK
+        if contested:
+            size = lead.shape[1], lead.shape[0]
+            lead = cv2.subtract(lead, cv2.resize(differs, size, interpolation=cv2.INTER_LINEAR))
+        else:
+            differs = None
+    alpha = np.asarray(cv2.bitwise_and(cv2.bitwise_or(lead, is_empty), is_new), np.uint8)
+    x, y, width, height = cv2.boundingRect(alpha)
+    if not width:
+        return Painted(None, overlap, contested, differs)
+    part = slice(y, y + height), slice(x, x + width)
+    left, top = old.box[0] + x, old.box[1] + y
+    pixels = _blended(old.pixels[part], new[part], alpha[part])
+    patch = Patch((left, top, left + width, top + height), pixels)
+    return Painted(patch, overlap, contested, differs)
+
+
+def _blended(old: Image, new: Image, alpha: Image) -> Image:
+    """``new`` over ``old`` (H, W, 4) by the share ``alpha`` (H, W) of 255."""
+    result = old.copy()
+    cv2.copyTo(new, cv2.inRange(alpha, 255, 255), result)
+    band = cv2.inRange(alpha, 1, 254)
+    count = cv2.countNonZero(band)
+    if count > alpha.size // 16:
+        share = cv2.merge([alpha] * 4)
+        over = cv2.multiply(new, share, scale=1 / 255)
+        under = cv2.multiply(old, cv2.bitwise_not(share), scale=1 / 255)
+        result = np.asarray(cv2.add(over, under), np.uint8)
+    elif count:
+        column, row = np.asarray(cv2.findNonZero(band)).reshape(-1, 2).T
+        some = alpha[row, column, None].astype(np.float32) / 255.0
+        before = old[row, column].astype(np.float32)
+        mixed = before + some * (new[row, column].astype(np.float32) - before)
+        result[row, column] = np.rint(mixed).astype(np.uint8)
+    return result

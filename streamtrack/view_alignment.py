@@ -1,0 +1,600 @@
+"""Direct alignment of two views of one scene: which mapping makes their grey values agree?
+
+Inverse compositional Gauss-Newton (Baker & Matthews 2004, section 3.2) over the most textured
+pixels of every part of a keyframe, from coarse to fine and from a similarity to a homography. It
+reads a few thousand pixels of the other view and nothing else, so it costs little, and it weighs
+every pixel by its gradient, which makes it several times as exact as matched points where texture
+is weak. Light that changes smoothly drops out by a high-pass filter and a gain, moving things by
+Tukey's biweight.
+
+The outcome is judged cell by cell: a cell agrees if its own pixels correlate and would not rather
+lie elsewhere. These cells are the point pairs on which the verdict rests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from streamtrack import geometry
+from streamtrack.registration import judge_mapping
+from streamtrack.types import Image, Mask, Matrix, Points, Size, Verdict
+
+Floats: TypeAlias = npt.NDArray[np.float32]
+Doubles: TypeAlias = npt.NDArray[np.float64]
+Rows: TypeAlias = npt.NDArray[np.intp]
+
+EXACT, USUAL = 0, 1  # levels: the one for links between keyframes, and the finest for frames
+_LONGEST_PX = (1024, 512)  # side of these two levels
+_COARSEST_PX = 40
+_MAX_LEVELS = 5
+_CELLS = (12, 9)
+_CELL_PIXELS = (180, 44, 20, 12, 8)  # chosen of each cell, by level
+_LEAST_PIXELS = (1000, 250, 60, 30, 20)  # in view, by level
+_HIGH_PASS_PX = 25
+_EDGE_PX = 3
+_MIN_GRADIENT = 0.8  # grey levels a pixel, RMS of a cell's chosen pixels
+_ROUNDS = (6, 8, 4, 4, 4)  # at most, by level
+_MAX_LAST_STEP_PX = 1.0  # of a fit that counts as converged
+_CONVERGED_PX = 0.01
+_CONVERGED_COARSE_PX = 0.15
+_MIN_CELL_PIXELS = 6
+_PERSPECTIVE_SIGMA = 0.05  # of the change against the guess, in units of half a view
+_SHAPE_SIGMA = 0.15
+_MIN_CELLS = 6
+_MIN_AGREEING_SHARE = 0.3
+_MIN_SPREAD_SHARE = 0.08
+_MIN_CELL_CORRELATION = 0.5
+_MIN_CORRELATION = 0.6
+_MAX_CELL_SHIFT_PX = 0.75  # pixels of the usual level
+_MAX_CORNER_SIGMA_PX = 2.0
+_CORRELATED = 3.0  # neighbouring pixels do not err independently: factor on predicted errors
+_SEARCH_SHARE = 0.3  # of the view: how far the search for a shift reaches
+
+_SIMILARITY = np.stack(
+    [np.eye(8)[2], np.eye(8)[5], np.eye(8)[0] + np.eye(8)[4], np.eye(8)[3] - np.eye(8)[1]], axis=1
+)
+_AFFINE = np.eye(8)[:, :6]
+_FREEDOMS = (np.eye(8), np.eye(8), _AFFINE, _SIMILARITY, _SIMILARITY)  # by level
+
+
+class ViewLevels:
+    """One view (H, W) in grey at halved resolutions, each high-passed when first needed.
+
+    The levels `EXACT` and `USUAL` are one for small pictures.
+    """
+
+    def __init__(self, grey: Image) -> None:
+        self.size_wh: Size = (grey.shape[1], grey.shape[0])
+        exact = _halved_to(grey, _LONGEST_PX[EXACT])
+        levels = [exact, _halved_to(exact, _LONGEST_PX[USUAL])]
+        while len(levels) < _MAX_LEVELS and max(levels[-1].shape) // 2 >= _COARSEST_PX:
+            levels.append(_halved(levels[-1]))
+        self.images: tuple[Image, ...] = tuple(levels)
+        self._high_passed: dict[int, Floats] = {}
+
+    @property
+    def usual(self) -> Image:
+        """The picture at the level at which frames are followed."""
+        return self.images[USUAL]
+
+    def level_from_view(self, level: int) -> Matrix:
+        """Pixels of the full view to pixels of a level."""
+        height, width = self.images[level].shape
+        return geometry.scaling(width / self.size_wh[0], height / self.size_wh[1])
+
+    def high_passed(self, level: int) -> Floats:
+        """Grey values, slightly smoothed, minus their local mean."""
+        if self.images[level] is self.images[USUAL]:
+            level = USUAL
+        found = self._high_passed.get(level)
+        if found is None:
+            smooth = cv2.GaussianBlur(self.images[level], (3, 3), 0.8).astype(np.float32)
+            window = (_HIGH_PASS_PX, _HIGH_PASS_PX)
+            found = np.asarray(smooth - cv2.blur(smooth, window), np.float32)
+            if level != EXACT:  # large, and needed once or twice
+                self._high_passed[level] = found
+        return found
+
+    def is_flat(self) -> bool:
+        """True if the view shows next to nothing: black, white, fog."""
+        return float(self.high_passed(len(self.images) - 1).std()) < 1.0
+
+
+def _halved(image: Image) -> Image:
+    size = max(1, image.shape[1] // 2), max(1, image.shape[0] // 2)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _halved_to(image: Image, longest_px: int) -> Image:
+    while max(image.shape) > longest_px:
+        image = _halved(image)
+    return image
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pixels:
+    """The chosen pixels of one level of a keyframe.
+
+    points     float32 (3, N), level pixels, with ones
+    values     float32 (N,), high-passed grey values
+    jacobian   float32 (N, 8), change of a value with each parameter of a homography in units
+    cell       int (N,), the cell each lies in, rising
+    """
+
+    points: Floats
+    values: Floats
+    jacobian: Floats
+    cell: Rows
+    unit_from_level: Matrix
+
+
+class ReferenceView:
+    """A view that others are aligned with: its textured pixels at every level."""
+
+    def __init__(self, levels: ViewLevels, hidden: Sequence[Points] = ()) -> None:
+        """``hidden`` are quads (4, 2) in the view that do not belong to the scene."""
+        self.levels = levels
+        self.size_wh = levels.size_wh
+        self._hidden = tuple(hidden)
+        self._pixels: dict[int, _Pixels] = {}
+
+    @property
+    def textured_cells(self) -> int:
+        """Cells that hold enough texture to be judged."""
+        return len(np.unique(self.pixels(USUAL).cell))
+
+    def pixels(self, level: int) -> _Pixels:
+        """The chosen pixels of a level, chosen when first asked for."""
+        if level not in self._pixels:
+            self._pixels[level] = _choose_pixels(self.levels, level, self._hidden)
+        return self._pixels[level]
+
+
+def _choose_pixels(levels: ViewLevels, level: int, hidden: Sequence[Points]) -> _Pixels:
+    values = levels.high_passed(level)
+    gx = np.asarray(cv2.Sobel(values, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8), np.float32)
+    gy = np.asarray(cv2.Sobel(values, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8), np.float32)
+    strength = np.asarray(gx * gx + gy * gy, np.float32)
+    strength[:_EDGE_PX] = strength[-_EDGE_PX:] = 0
+    strength[:, :_EDGE_PX] = strength[:, -_EDGE_PX:] = 0
+    for quad in hidden:
+        seen = geometry.transform_points(levels.level_from_view(level), quad)
+        if np.isfinite(seen).all():
+            outline = np.rint(np.clip(seen, -1e6, 1e6)).astype(np.int32)
+            cv2.fillConvexPoly(strength, outline, 0.0)
+    row, column, cell = _strongest(strength, _CELL_PIXELS[level])
+    height, width = values.shape
+    unit = 2.0 / max(width, height)
+    unit_from_level = np.array(
+        [[unit, 0, -unit * (width - 1) / 2], [0, unit, -unit * (height - 1) / 2], [0, 0, 1]]
+    )
+    points = np.stack([column, row, np.ones_like(row)]).astype(np.float32)
+    x, y = column * unit + unit_from_level[0, 2], row * unit + unit_from_level[1, 2]
+    u, v = gx[row, column] / unit, gy[row, column] / unit
+    radial = u * x + v * y
+    parts = [u * x, u * y, u, v * x, v * y, v, -x * radial, -y * radial]
+    jacobian = np.stack(parts, axis=1).astype(np.float32)
+    return _Pixels(points, values[row, column], jacobian, cell, unit_from_level)
+
+
+def _strongest(strength: Floats, count: int) -> tuple[Rows, Rows, Rows]:
+    """Row, column and cell of the ``count`` strongest pixels of every cell that has texture."""
+    height, width = strength.shape
+    across, down = _CELLS
+    cell_w, cell_h = -(-width // across), -(-height // down)
+    padded = np.zeros((down * cell_h, across * cell_w), np.float32)
+    padded[:height, :width] = strength
+    cells = padded.reshape(down, cell_h, across, cell_w).swapaxes(1, 2).reshape(down * across, -1)
+    count = min(count, cells.shape[1])
+    best = np.argpartition(-cells, count - 1, axis=1)[:, :count]
+    best.sort(axis=1)
+    chosen = np.take_along_axis(cells, best, axis=1)
+    is_textured = chosen.mean(axis=1) >= _MIN_GRADIENT**2
+    cell = np.broadcast_to(np.arange(len(cells))[:, None], best.shape)
+    kept = (chosen > 0) & is_textured[:, None]
+    within, cell = best[kept], cell[kept]
+    row = (cell // across) * cell_h + within // cell_w
+    column = (cell % across) * cell_w + within % cell_w
+    return row.astype(np.intp), column.astype(np.intp), cell.astype(np.intp)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewAlignment:
+    """How another view maps into a reference view, with its evidence and its verdict.
+
+    reference_from_view  None unless the verdict is OK
+    reference_points     float32 (M, 2), middles of the reference's cells that both views show
+    view_points          float32 (M, 2), where the alignment takes them in the other view
+    is_inlier            bool (M,), the cell agrees
+    rmse_px              of the shifts that agreeing cells would still like to make, view pixels
+    correlation          normalised cross-correlation of the agreeing cells' pixels, or NaN
+    corner_sigma_px      predicted error of the view's corners, reference pixels, or inf
+    sharpness            gradient energy of the view against the reference's: below 1 if blurred
+    """
+
+    verdict: Verdict
+    reference_from_view: Matrix | None
+    reference_points: Points
+    view_points: Points
+    is_inlier: Mask
+    rmse_px: float = float("nan")
+    correlation: float = float("nan")
+    corner_sigma_px: float = float("inf")
+    sharpness: float = float("nan")
+
+    @property
+    def inliers(self) -> int:
+        return int(np.count_nonzero(self.is_inlier))
+
+
+def align(
+    reference: ReferenceView,
+    view: ViewLevels,
+    guess: Matrix,
+    hidden: Sequence[Points] = (),
+    *,
+    is_searched: bool = False,
+) -> ViewAlignment:
+    """The mapping near ``guess`` (reference_from_view) that makes the views agree, judged.
+
+    ``hidden`` are quads (4, 2) in the view that do not belong to the scene. ``is_searched`` looks
+    for a shift first, as far as a third of the view, for guesses that may be far off.
+    """
+    try:
+        view_from_reference = geometry.inverted(guess)
+    except np.linalg.LinAlgError:
+        return _refusal(Verdict.MIRRORED)
+    if judge_mapping(view_from_reference, geometry.image_quad(reference.size_wh)) is not Verdict.OK:
+        return _refusal(Verdict.PERSPECTIVE)
+    if is_searched:
+        view_from_reference = _shifted(reference, view, view_from_reference)
+    last = min(len(reference.levels.images), len(view.images)) - 1
+    fitted: _Fitted | None = None
+    start = view_from_reference
+    for level in range(last, USUAL - 1, -1):
+        if fitted is not None:
+            # Coarse levels may lead astray where texture is fine or weak.
+            tried = (view_from_reference, start)
+            view_from_reference = max(tried, key=lambda m: _likeness(reference, view, level, m))
+        fitted = _fit(reference, view, level, view_from_reference, hidden)
+        if fitted is None:
+            return _refusal(Verdict.TOO_FEW_FEATURES if level == USUAL else Verdict.OUT_OF_VIEW)
+        view_from_reference = fitted.view_from_reference
+    assert fitted is not None
+    return _judged(reference, view, fitted)
+
+
+def align_exactly(reference: ReferenceView, view: ViewLevels, guess: Matrix) -> ViewAlignment:
+    """As `align`, from a guess that is right to a pixel or two: more pixels, full resolution."""
+    try:
+        start = geometry.inverted(guess)
+    except np.linalg.LinAlgError:
+        return _refusal(Verdict.MIRRORED)
+    fitted = _fit(reference, view, EXACT, start, ())
+    return (
+        _refusal(Verdict.TOO_FEW_FEATURES) if fitted is None else _judged(reference, view, fitted)
+    )
+
+
+def _refusal(verdict: Verdict) -> ViewAlignment:
+    none = np.zeros((0, 2), np.float32)
+    return ViewAlignment(verdict, None, none, none, np.zeros(0, np.bool_))
+
+
+def _shifted(reference: ReferenceView, view: ViewLevels, view_from_reference: Matrix) -> Matrix:
+    """The guess after the shift under which the middle of the overlap correlates best.
+
+    At the coarsest level: the view is warped as the guess has it, and the middle of the
+    reference is looked for in it.
+    """
+    level = min(len(reference.levels.images), len(view.images)) - 1
+    wanted = reference.levels.high_passed(level)
+    height, width = wanted.shape
+    to_reference, to_view = reference.levels.level_from_view(level), view.level_from_view(level)
+    mapping = to_view @ view_from_reference @ geometry.inverted(to_reference)
+    reach_x, reach_y = int(_SEARCH_SHARE * width), int(_SEARCH_SHARE * height)
+    # A wider warp: what the reference's frame would see with a border all round.
+    size = width + 2 * reach_x, height + 2 * reach_y
+    wide = cv2.warpPerspective(
+        view.high_passed(level),
+        mapping @ geometry.translation(-reach_x, -reach_y),
+        size,
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=0.0,
+    )
+    quarter_x, quarter_y = width // 4, height // 4
+    patch = wanted[quarter_y : height - quarter_y, quarter_x : width - quarter_x]
+    around = wide[quarter_y : size[1] - quarter_y, quarter_x : size[0] - quarter_x]
+    # Nothing correlates with the empty border, so weak overlaps do not win by chance.
+    score = cv2.matchTemplate(
+        np.asarray(around, np.float32), np.ascontiguousarray(patch), cv2.TM_CCORR
+    )
+    y, x = np.unravel_index(int(np.argmax(score)), score.shape)
+    shift = geometry.translation(float(x) - reach_x, float(y) - reach_y)
+    moved = geometry.inverted(to_view) @ mapping @ shift @ to_reference
+    return geometry.normalized(moved)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fitted:
+    """A fit at one level: the mapping, and the pixels (N,) it rests on."""
+
+    view_from_reference: Matrix
+    level: int
+    pixels: _Pixels
+    seen: Floats
+    residual: Floats
+    normal: Doubles
+    is_settled: bool
+
+
+def _fit(
+    reference: ReferenceView,
+    view: ViewLevels,
+    level: int,
+    start: Matrix,
+    hidden: Sequence[Points],
+) -> _Fitted | None:
+    """Gauss-Newton at one level from ``start`` (view_from_reference), or None."""
+    values = view.high_passed(level)
+    to_reference, to_view = reference.levels.level_from_view(level), view.level_from_view(level)
+    mapping = to_view @ start @ geometry.inverted(to_reference)
+    outlines = [geometry.transform_points(to_view, quad) for quad in hidden]
+    pixels = _in_view(reference.pixels(level), mapping, values.shape, outlines)
+    if len(pixels.values) < _LEAST_PIXELS[level]:
+        return None
+    basis = _FREEDOMS[level]
+    is_full = basis.shape[1] == 8
+    jacobian = pixels.jacobian if is_full else pixels.jacobian @ basis.astype(np.float32)
+    unit, level_from_unit = pixels.unit_from_level, geometry.inverted(pixels.unit_from_level)
+    unit_px = level_from_unit[0, 0]
+    prior = basis.T @ _PRIOR @ basis
+    change = np.zeros(basis.shape[1])
+    seen, residual, normal, moved_px = pixels.values, pixels.values, prior, 0.0
+    for _ in range(_ROUNDS[level]):
+        seen = _sampled(values, mapping, pixels.points)
+        residual, precisions = _residuals(pixels.values, seen)
+        weighted = jacobian * precisions[:, None]
+        normal = (weighted.T @ jacobian).astype(np.float64) + prior
+        gradient = (residual @ weighted).astype(np.float64) - prior @ change
+        try:
+            step = np.linalg.solve(normal, gradient)
+        except np.linalg.LinAlgError:
+            return None
+        if not np.abs(step).max() < 0.5:
+            return None
+        change += step
+        unit_step = np.eye(3) + np.append(basis @ step, 0.0).reshape(3, 3)
+        mapping = mapping @ geometry.inverted(level_from_unit @ unit_step @ unit)
+        moved_px = float(np.abs(step).max() * unit_px)
+        if moved_px < (_CONVERGED_PX if level <= USUAL else _CONVERGED_COARSE_PX):
+            break
+    found = geometry.inverted(to_view) @ mapping @ to_reference
+    if not np.isfinite(found).all() or abs(found[2, 2]) < 1e-9:
+        return None
+    is_settled = moved_px <= _MAX_LAST_STEP_PX
+    return _Fitted(geometry.normalized(found), level, pixels, seen, residual, normal, is_settled)
+
+
+def _likeness(
+    reference: ReferenceView, view: ViewLevels, level: int, view_from_reference: Matrix
+) -> float:
+    """Correlation of a level's pixels under a mapping, those out of view counting as unlike."""
+    to_reference, to_view = reference.levels.level_from_view(level), view.level_from_view(level)
+    mapping = to_view @ view_from_reference @ geometry.inverted(to_reference)
+    pixels = reference.pixels(level)
+    values = view.high_passed(level)
+    x, y, depth = _projected(mapping, pixels.points[:, ::2])
+    seen = _remapped(values, x, y, cv2.BORDER_CONSTANT)
+    seen[depth <= 0] = 0
+    wanted = pixels.values[::2]
+    return float(wanted @ seen) / float(np.sqrt((wanted @ wanted) * (seen @ seen)) + 1.0)
+
+
+def _make_prior() -> Doubles:
+    """Precisions of a change: shape and perspective seldom change much from view to view."""
+    precisions = np.zeros((8, 8))
+    precisions[6, 6] = precisions[7, 7] = _PERSPECTIVE_SIGMA**-2
+    stretch = np.array([[1.0, 0, 0, 0, -1.0, 0, 0, 0], [0, 1.0, 0, 1.0, 0, 0, 0, 0]])
+    return np.asarray(precisions + stretch.T @ stretch * _SHAPE_SIGMA**-2, np.float64)
+
+
+_PRIOR = _make_prior()
+
+
+def _in_view(
+    pixels: _Pixels, mapping: Matrix, shape: tuple[int, ...], outlines: Sequence[Points]
+) -> _Pixels:
+    """Those of the pixels that the view shows, outside the outlines (4, 2)."""
+    x, y, depth = _projected(mapping, pixels.points)
+    height, width = shape
+    edge = _EDGE_PX
+    inside = (x >= edge) & (y >= edge) & (x < width - 1 - edge) & (y < height - 1 - edge)
+    inside &= depth > 0
+    for outline in outlines:
+        inside &= ~_within(outline, x, y)
+    if inside.all():
+        return pixels
+    rows = np.flatnonzero(inside)
+    return _Pixels(
+        pixels.points[:, rows],
+        pixels.values[rows],
+        pixels.jacobian[rows],
+        pixels.cell[rows],
+        pixels.unit_from_level,
+    )
+
+
+def _projected(mapping: Matrix, points: Floats) -> tuple[Floats, Floats, Floats]:
+    """x, y and depth (N,) of points (3, N)."""
+    moved = mapping.astype(np.float32) @ points
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return moved[0] / moved[2], moved[1] / moved[2], moved[2]
+
+
+def _within(outline: Points, x: Floats, y: Floats) -> Mask:
+    """Which points (N,) lie in a convex quad (4, 2)."""
+    inside = np.ones(len(x), np.bool_)
+    turned = np.sign(geometry.signed_area(outline))
+    for (x0, y0), (x1, y1) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        inside &= ((x1 - x0) * (y - y0) - (y1 - y0) * (x - x0)) * turned >= 0
+    return inside
+
+
+def _sampled(values: Floats, mapping: Matrix, points: Floats) -> Floats:
+    """Values (N,) at where ``mapping`` takes the points (3, N)."""
+    x, y, _ = _projected(mapping, points)
+    return _remapped(values, x, y, cv2.BORDER_REPLICATE)
+
+
+def _remapped(values: Floats, x: Floats, y: Floats, border: int) -> Floats:
+    sampled = cv2.remap(values, x[None], y[None], cv2.INTER_LINEAR, borderMode=border)
+    return np.asarray(sampled, np.float32).reshape(-1)
+
+
+def _residuals(wanted: Floats, seen: Floats) -> tuple[Floats, Floats]:
+    """What the view (N,) has more than wanted after a gain, and the precision of each: Tukey's
+    weights over the noise squared."""
+    gain = (_median_size(wanted) + 0.2) / (_median_size(seen) + 0.2)
+    residual = np.float32(min(3.0, max(0.33, gain))) * seen - wanted
+    noise = 1.4826 * _median_size(residual) + 0.3
+    share = residual * np.float32(1 / (4.685 * noise))
+    weights = np.maximum(np.float32(0), 1 - share * share)
+    weights *= weights
+    precisions: Floats = weights * np.float32(1 / noise**2)
+    return residual, precisions
+
+
+def _median_size(values: Floats) -> float:
+    """Median of the absolute values, from every fifth of them."""
+    sizes = np.abs(values[::5])
+    middle = len(sizes) // 2
+    sizes.partition(middle)
+    return float(sizes[middle])
+
+
+# -- the verdict --------------------------------------------------------------------------------
+
+
+def _judged(reference: ReferenceView, view: ViewLevels, fitted: _Fitted) -> ViewAlignment:
+    """The alignment with its cells' evidence, refused with the first reason that applies."""
+    usual_px = view.images[fitted.level].shape[1] / view.images[USUAL].shape[1]
+    cells = _cells(fitted, _MAX_CELL_SHIFT_PX * usual_px)
+    reference_from_level = geometry.inverted(reference.levels.level_from_view(fitted.level))
+    reference_points = geometry.transform_points(reference_from_level, cells.middles)
+    view_points = geometry.transform_points(fitted.view_from_reference, reference_points)
+    view_px = view.size_wh[0] / view.images[fitted.level].shape[1]
+    agreeing = cells.is_agreeing
+    shifts = cells.shifts_px[agreeing]
+    rmse_px = float(np.sqrt(np.mean(shifts**2))) * view_px if len(shifts) else float("nan")
+    found = ViewAlignment(
+        Verdict.OK,
+        None,
+        reference_points,
+        view_points,
+        agreeing,
+        rmse_px,
+        cells.correlation,
+        sharpness=cells.sharpness,
+    )
+    verdict = _support_verdict(found, view)
+    if verdict is not Verdict.OK:
+        return replace(found, verdict=verdict)
+    try:
+        reference_from_view = geometry.inverted(fitted.view_from_reference)
+    except np.linalg.LinAlgError:
+        return replace(found, verdict=Verdict.MIRRORED)
+    sigma_px = _corner_sigma_px(reference, fitted, reference_from_view, view.size_wh)
+    found = replace(found, corner_sigma_px=sigma_px)
+    verdict = judge_mapping(reference_from_view, geometry.image_quad(view.size_wh))
+    is_certain = fitted.is_settled and sigma_px <= _MAX_CORNER_SIGMA_PX
+    if verdict is Verdict.OK and not is_certain:
+        verdict = Verdict.UNCERTAIN
+    if verdict is not Verdict.OK:
+        return replace(found, verdict=verdict)
+    return replace(found, reference_from_view=reference_from_view)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cells:
+    """Evidence of the cells (M,) that both views show."""
+
+    middles: Doubles
+    shifts_px: Doubles
+    is_agreeing: Mask
+    correlation: float
+    sharpness: float
+
+
+def _cells(fitted: _Fitted, max_shift_px: float) -> _Cells:
+    pixels = fitted.pixels
+    starts = np.flatnonzero(np.diff(pixels.cell, prepend=-1))
+    wanted, got = pixels.values, fitted.seen
+    unit = np.float32(pixels.unit_from_level[0, 0])
+    gx, gy = pixels.jacobian[:, 2] * unit, pixels.jacobian[:, 5] * unit
+    r = fitted.residual
+    x, y, one = pixels.points
+    terms = [one, x, y, wanted, got, wanted * wanted, got * got, wanted * got]
+    terms += [gx * gx, gy * gy, gx * gy, gx * r, gy * r]
+    sums = np.add.reduceat(np.stack(terms), starts, axis=1).astype(np.float64)
+    n, sum_x, sum_y, w, g, ww, gg, wg, xx, yy, xy, rx, ry = sums
+    covariance = wg / n - w * g / n**2
+    variances = np.maximum(ww / n - (w / n) ** 2, 0) * np.maximum(gg / n - (g / n) ** 2, 0)
+    correlation = covariance / np.sqrt(variances + 1e-6)
+    # Shift that would suit the cell's own pixels best, held small where texture says nothing.
+    xx, yy = xx + n, yy + n
+    shift = np.hypot(yy * rx - xy * ry, xx * ry - xy * rx) / (xx * yy - xy * xy)
+    shown = n >= _MIN_CELL_PIXELS
+    agreeing = shown & (correlation >= _MIN_CELL_CORRELATION) & (shift <= max_shift_px)
+    middles = np.stack([sum_x / n, sum_y / n], axis=1)
+    together, ratio = float("nan"), float("nan")
+    if agreeing.any():
+        count, w, g, ww, gg, wg = sums[[0, 3, 4, 5, 6, 7]][:, agreeing].sum(axis=1)
+        variance_w, variance_g = ww / count - (w / count) ** 2, gg / count - (g / count) ** 2
+        together = float((wg / count - w * g / count**2) / np.sqrt(variance_w * variance_g + 1e-9))
+        ratio = float(np.sqrt(variance_g / max(float(variance_w), 1e-9)))
+    return _Cells(middles[shown], shift[shown], agreeing[shown], together, ratio)
+
+
+def _support_verdict(found: ViewAlignment, view: ViewLevels) -> Verdict:
+    shown = len(found.is_inlier)
+    if shown < _MIN_CELLS:
+        return Verdict.TOO_FEW_FEATURES
+    if found.inliers < max(_MIN_CELLS, _MIN_AGREEING_SHARE * shown):
+        return Verdict.TOO_FEW_INLIERS
+    hull = cv2.convexHull(found.view_points[found.is_inlier])
+    share = float(cv2.contourArea(hull)) / (view.size_wh[0] * view.size_wh[1])
+    if share < _MIN_SPREAD_SHARE:
+        return Verdict.NOT_SPREAD
+    if not found.correlation >= _MIN_CORRELATION:
+        return Verdict.LOW_CORRELATION
+    return Verdict.OK
+
+
+def _corner_sigma_px(
+    reference: ReferenceView, fitted: _Fitted, reference_from_view: Matrix, size_wh: Size
+) -> float:
+    """Predicted standard deviation of the view's worst corner, in reference pixels."""
+    corners = geometry.transform_points(reference_from_view, geometry.image_quad(size_wh))
+    to_unit = fitted.pixels.unit_from_level @ reference.levels.level_from_view(fitted.level)
+    unit = geometry.transform_points(to_unit, corners).astype(np.float64)
+    if not np.isfinite(unit).all():
+        return float("inf")
+    x, y = unit.T
+    one, zero = np.ones(4), np.zeros(4)
+    rows_x = np.stack([x, y, one, zero, zero, zero, -x * x, -x * y], axis=1)
+    rows_y = np.stack([zero, zero, zero, x, y, one, -x * y, -y * y], axis=1)
+    try:
+        covariance = np.linalg.inv(fitted.normal)
+    except np.linalg.LinAlgError:
+        return float("inf")
+    variance = np.sum(rows_x @ covariance * rows_x + rows_y @ covariance * rows_y, axis=1)
+    worst = float(np.sqrt(max(float(np.max(variance)), 0.0)))
+    return float(_CORRELATED * worst / to_unit[0, 0])

@@ -1,0 +1,106 @@
+"""Recent views of a target that is not flat: what it looked like when it was last seen clearly.
+
+The first view is what a target is; it is kept for ever and tried in every frame. A car that turns
+or a running animal stops looking like it, though from one frame to the next it changes little.
+So each frame in which the target was seen clearly is remembered, and when the first view no longer
+explains the target, the frame is aligned with the newest remembered one. Only places that were seen
+to belong to the target are compared, so that an occluder never becomes part of it, and only few
+freedoms are estimated, since a curved surface does not move as a plane.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from streamtrack import geometry
+from streamtrack.flow import Alignment, FlowAligner
+from streamtrack.frame_view import FrameView
+from streamtrack.settings import RegistrationSettings
+from streamtrack.template import MIN_FLOW_POINTS, Template, make_patches
+from streamtrack.types import Image, Matrix, Model, Points, Verdict
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sight:
+    """One clear sight of the target: the grey frame, the pose in it, and where it was seen to be.
+
+    ``shown`` (N, 2) are the points of this frame that agreed with the pose.
+    """
+
+    grey: Image
+    frame_from_template: Matrix
+    shown: Points
+
+
+class RecentViews:
+    """The newest clear sight of one target, made into a template when it is needed."""
+
+    def __init__(self, template: Template, settings: RegistrationSettings) -> None:
+        self._template = template
+        self._settings = settings.model_copy(update={"model": Model.SIMILARITY.value})
+        self._newest: _Sight | None = None
+        self._in_use: _Sight | None = None
+        self._aligner: FlowAligner | None = None
+
+    def remember(self, view: FrameView, alignment: Alignment) -> None:
+        """Keep a frame in which the target was seen clearly."""
+        found = alignment.registration
+        if found.b_from_a is not None:
+            shown = alignment.frame_points[found.is_inlier]
+            self._newest = _Sight(view.grey, found.b_from_a, shown)
+
+    def forget(self) -> None:
+        """The target was lost: what it looked like then says little about where it is now."""
+        self._newest = self._in_use = self._aligner = None
+
+    def align(self, view: FrameView, guess: Matrix) -> Alignment | None:
+        """The pose near ``guess`` by the view in use, else by the newest one; None without any.
+
+        Poses and points are in template pixels, as those of the first view.
+        """
+        aligned = self._align_in_use(view, guess)
+        if aligned is not None and aligned.registration.verdict is Verdict.OK:
+            return aligned
+        if self._newest is None or self._newest is self._in_use:
+            return aligned
+        self._use_newest()
+        return self._align_in_use(view, guess)
+
+    def renew(self) -> None:
+        """Compare with the newest sight from now on."""
+        if self._newest is not None and self._newest is not self._in_use:
+            self._use_newest()
+
+    def _use_newest(self) -> None:
+        assert self._newest is not None
+        sight = self._in_use = self._newest
+        quad = geometry.transform_points(sight.frame_from_template, self._template.quad)
+        patches = make_patches(sight.grey, quad, sight.shown)
+        if not patches or len(patches[0].points) < MIN_FLOW_POINTS:
+            self._aligner = None
+            return
+        seen = replace(self._template, picture=sight.grey, quad=quad, patches=patches)
+        self._aligner = FlowAligner(seen, self._settings)
+
+    def _align_in_use(self, view: FrameView, guess: Matrix) -> Alignment | None:
+        if self._in_use is None or self._aligner is None:
+            return None
+        sight_from_template = self._in_use.frame_from_template
+        template_from_sight = geometry.inverted(sight_from_template)
+        aligned = self._aligner.align(view, guess @ template_from_sight)
+        found = aligned.registration
+        if found.b_from_a is not None:
+            pose = geometry.normalized(found.b_from_a @ sight_from_template)
+            found = replace(found, b_from_a=pose, model=Model.SIMILARITY)
+        points = geometry.transform_points(template_from_sight, aligned.template_points)
+        return replace(aligned, registration=found, template_points=points)
+
+
+def agreeing_share(alignment: Alignment) -> float:
+    """Share (0..1) of the points in view that agree with the pose; 0 if it was refused."""
+    found = alignment.registration
+    if found.b_from_a is None or not len(found.is_inlier):
+        return 0.0
+    return float(np.mean(found.is_inlier))

@@ -1,0 +1,225 @@
+"""Who looks at a run's Steps: tables, pictures, recording, live view, mosaic.
+
+Watchers watch and decide nothing. Each is a function of a `Step`; a finisher is called once with
+the summary when the last one has gone by.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+from streamtrack.camera import CameraEstimator, MovingCamera
+from streamtrack.errors import OutputError, StreamtrackError
+from streamtrack.results import PosesWriter, open_tracks_writer
+from streamtrack.settings import Settings
+from streamtrack.sources.base import FrameSource
+from streamtrack.summary import Summary
+from streamtrack.types import Image, SourceInfo, Step
+
+if TYPE_CHECKING:
+    from streamtrack.live_server import LiveAddress
+    from streamtrack.live_view import LiveView
+    from streamtrack.recording import Recorder
+    from streamtrack.sources.live import LiveSource
+
+Watcher: TypeAlias = Callable[[Step], None]
+Finisher: TypeAlias = Callable[[Summary], None]
+
+_FALLBACK_RATE_HZ = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """Where the results go; None where they are not wanted."""
+
+    record: Path | None = None
+    tracks: Path | None = None
+    poses: Path | None = None
+    video: Path | None = None
+    summary: Path | None = None
+    mosaic: Path | None = None
+    live: LiveAddress | None = None
+
+
+@dataclass(slots=True)
+class Watchers:
+    """All of one run's; what an output needs at the end is in the exit stack it was opened with."""
+
+    watchers: list[Watcher] = field(default_factory=list)
+    finishers: list[Finisher] = field(default_factory=list)
+    recorder: Recorder | None = None
+
+    def watch(self, step: Step) -> None:
+        for watcher in self.watchers:
+            watcher(step)
+
+    def finish(self, summary: Summary) -> StreamtrackError | None:
+        """Complete all outputs; returns what went wrong with one that did not stop the run."""
+        failure: StreamtrackError | None = None
+        for finisher in self.finishers:
+            try:
+                finisher(summary)
+            except StreamtrackError as error:
+                failure = failure or error
+        recorder = self.recorder
+        if failure is None and recorder is not None and recorder.failed is not None:
+            failure = OutputError(
+                f"the recording {recorder.path} ended early ({recorder.failed}); "
+                "all else is complete"
+            )
+        return failure
+
+
+def open_watchers(
+    outputs: Outputs,
+    source: FrameSource,
+    settings: Settings,
+    views: Mapping[str, Image | None],
+    camera: CameraEstimator,
+    stack: ExitStack,
+) -> Watchers:
+    """Open every output that is wanted; ``views`` holds each target's template picture or None.
+
+    Raises OutputError.
+    """
+    info, result = source.info, Watchers()
+    if outputs.summary is not None:
+        result.finishers.append(_summary_finisher(outputs.summary))
+    if outputs.tracks is not None:
+        result.watchers.append(stack.enter_context(open_tracks_writer(outputs.tracks)).write)
+    if outputs.poses is not None:
+        poses = stack.enter_context(PosesWriter(outputs.poses))
+        result.watchers.append(poses.write)
+        result.finishers.append(_skipped_finisher(poses))
+    if outputs.video is not None:
+        result.watchers.append(_video_watcher(outputs.video, info, stack))
+    displays = _open_displays(outputs, info, settings, views, stack, result)
+    result.watchers.extend(display.log for display in displays)
+    if outputs.mosaic is not None:
+        _add_mosaic(outputs.mosaic, settings, camera, displays, stack, result)
+    live = live_source(source)
+    if live is not None:
+        result.watchers.append(_live_watcher(live, displays))
+    result.finishers.extend(_closer(display) for display in displays)
+    return result
+
+
+def live_source(source: FrameSource) -> LiveSource | None:
+    """The source as a live one, if it is."""
+    from streamtrack.sources.live import LiveSource
+
+    return source if isinstance(source, LiveSource) else None
+
+
+def _open_displays(
+    outputs: Outputs,
+    info: SourceInfo,
+    settings: Settings,
+    views: Mapping[str, Image | None],
+    stack: ExitStack,
+    result: Watchers,
+) -> list[Recorder | LiveView]:
+    """The recording and the live view: both take the same."""
+    displays: list[Recorder | LiveView] = []
+    pictures = {name: picture for name, picture in views.items() if picture is not None}
+    about = (info, settings, list(views), pictures, outputs.mosaic is not None)
+    if outputs.record is not None:
+        from streamtrack.recording import Recorder
+
+        result.recorder = stack.enter_context(Recorder(outputs.record, *about))
+        displays.append(result.recorder)
+    if outputs.live is not None:
+        from streamtrack.live_view import LiveView
+
+        displays.append(stack.enter_context(LiveView(outputs.live, *about)))
+    return displays
+
+
+def _closer(display: Recorder | LiveView) -> Finisher:
+    return lambda summary: display.close(summary.to_markdown())
+
+
+def _add_mosaic(
+    path: Path,
+    settings: Settings,
+    camera: CameraEstimator,
+    displays: Sequence[Recorder | LiveView],
+    stack: ExitStack,
+    result: Watchers,
+) -> None:
+    """Grow a mosaic with the run and write it at the end; targets are left out of it."""
+    from streamtrack.mosaic.stream import StreamMosaic
+
+    graph = camera.graph if isinstance(camera, MovingCamera) else None
+    mosaic = stack.enter_context(StreamMosaic(settings.mosaic, graph))
+    last: list[tuple[int, float]] = []
+
+    def watch(step: Step) -> None:
+        frame, pose = step.frame, step.camera
+        reason = mosaic.add(frame, pose, step.tracks)
+        last[:] = [(frame.index, frame.time_s)]
+        world_from_frame = None if reason else pose.world_from_frame
+        state = "placed" if not reason else "lost" if pose.world_from_frame is None else "refused"
+        found = {"inliers": float(pose.inliers), "rmse_px": pose.rmse_px}
+        metrics = {name: value for name, value in found.items() if math.isfinite(value)}
+        for display in displays:
+            place = (frame.index, frame.time_s, frame.size_wh, world_from_frame)
+            display.log_mosaic_frame(*place, state, reason, metrics)
+            if display.is_mosaic_due(frame.time_s):
+                display.log_mosaic(mosaic.view(), frame.index, frame.time_s)
+
+    def finish(_summary: Summary) -> None:
+        if isinstance(camera, MovingCamera):
+            camera.close()  # from here on the poses are final
+        mosaic.finish(path)
+        for display in displays:
+            for index, time_s in last:
+                display.log_mosaic(mosaic.view(), index, time_s)
+
+    result.watchers.append(watch)
+    result.finishers.append(finish)
+
+
+def _live_watcher(source: LiveSource, displays: Sequence[Recorder | LiveView]) -> Watcher:
+    """Tells the displays how the source does, and the source when its frame is done with."""
+
+    def watch(step: Step) -> None:
+        status = source.status()
+        counts = {name: getattr(status, name) for name in ("dropped", "lost", "damaged")}
+        for event in source.drain_events():
+            for display in displays:
+                display.log_source(str(event.state), counts, time_s=event.time_s)
+        source.note_output(step.frame)
+
+    return watch
+
+
+def _summary_finisher(path: Path) -> Finisher:
+    return lambda summary: summary.write_json(path)
+
+
+def _skipped_finisher(poses: PosesWriter) -> Finisher:
+    def finish(summary: Summary) -> None:
+        for skipped in summary.skipped:
+            poses.write_skipped(skipped)
+
+    return finish
+
+
+def _video_watcher(path: Path, info: SourceInfo, stack: ExitStack) -> Watcher:
+    from streamtrack.overlay import Trails, draw_step
+    from streamtrack.sources.writer import VideoWriter
+
+    rate_hz = info.rate_hz or _FALLBACK_RATE_HZ
+    writer = stack.enter_context(VideoWriter(path, rate_hz=rate_hz))
+    trails = Trails()
+
+    def watch(step: Step) -> None:
+        writer.write(draw_step(step, trail=trails.follow(step)), step.frame.time_s)
+
+    return watch

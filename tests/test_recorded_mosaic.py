@@ -1,0 +1,252 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+from rrd import rrd_columns, rrd_entities
+from test_recording import BLOB, SIZE, blob, picture, source, step_of, tracked
+
+from streamtrack.errors import OutputError
+from streamtrack.geometry import box_quad, scaling, transform_points, translation
+from streamtrack.mosaic.types import (
+    KeyframeEdge,
+    Link,
+    MosaicView,
+    Picture,
+    Placement,
+    Status,
+)
+from streamtrack.recorded_pictures import record_picture_mosaic
+from streamtrack.recording import Recorder
+from streamtrack.settings import Settings, build_settings
+from streamtrack.types import Features, Matches, Model, Registration, Verdict
+
+STRIPS = "LineStrips2D:strips"
+FRAME = box_quad(0, 0, SIZE[0] - 1, SIZE[1] - 1)
+
+
+def pose(index):
+    return translation(3.0 * index, 5.0)
+
+
+def keyframes(shift=0.0):
+    outlines = [transform_points(pose(index), FRAME) for index in (0, 20)]
+    return np.stack(outlines) + np.float32(shift)
+
+
+def mosaic_view(width=400, shift=0.0, edges=(), names=()):
+    """A preview at half size whose top left is the world's (-10, -20)."""
+    preview = np.random.default_rng(0).integers(0, 255, (200, width, 3), np.uint8)
+    world_from_preview = translation(-10, -20) @ scaling(2.0)
+    return MosaicView(preview, world_from_preview, None, keyframes(shift), edges, names)
+
+
+def preview_from_world():
+    return np.linalg.inv(translation(-10, -20) @ scaling(2.0))
+
+
+def log_mosaic(recorder, index, view=None, is_placed=True):
+    recorder.log(step_of(index, lost=range(30, 40)))
+    recorder.log_mosaic_frame(
+        index,
+        index / 25,
+        SIZE,
+        pose(index) if is_placed else None,
+        "placed" if is_placed else "lost",
+        "" if is_placed else "too few inliers",
+        {"keyframes": 2},
+    )
+    recorder.log_mosaic(view or mosaic_view(), index, index / 25)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    path = tmp_path_factory.mktemp("mosaic") / "run.rrd"
+    edges = (
+        KeyframeEdge(7, 90, 50, 0.5, False),
+        KeyframeEdge(90, 7, 40, 0.6, True),
+        KeyframeEdge(7, 8, 40, 0.6, True),  # a keyframe that is not shown
+    )
+    with Recorder(path, source(), Settings(), ["board"], has_mosaic=True) as recorder:
+        for index in range(60):
+            log_mosaic(
+                recorder,
+                index,
+                mosaic_view(400, 40.0 if index >= 50 else 0.0, edges, (7, 90)),
+                is_placed=not 10 <= index < 15,
+            )
+    return path
+
+
+def test_entities_of_the_mosaic_are_there(recorded):
+    assert {
+        "/mosaic/image",
+        "/mosaic/frame",
+        "/mosaic/keyframes",
+        "/mosaic/links",
+        "/mosaic/loops",
+        "/mosaic/state",
+        "/mosaic/targets/board/path",
+        "/metrics/mosaic/keyframes",
+    } <= set(rrd_entities(recorded))
+    assert RrdReader(recorded).blueprints()
+
+
+def test_the_picture_comes_once_a_second_and_at_the_end(recorded):
+    frames, pictures = rrd_columns(recorded, "/mosaic/image", BLOB)
+    assert frames == [0, 25, 50, 59]
+    assert cv2.imdecode(np.frombuffer(blob(pictures[0]), np.uint8), 1).shape == (200, 400, 3)
+
+
+def test_the_frame_lies_where_it_was_placed(recorded):
+    frames, outlines = rrd_columns(recorded, "/mosaic/frame", STRIPS)
+    outlines = dict(zip(frames, outlines, strict=True))
+    assert frames == [*range(1, 11), *range(15, 60)]
+    assert outlines[10] == []  # lost: nothing is drawn
+    expected = transform_points(preview_from_world() @ pose(30), FRAME)
+    np.testing.assert_allclose(outlines[30][0][:4], expected, atol=1e-3)
+
+
+def test_keyframes_links_and_loops(recorded):
+    quads = rrd_columns(recorded, "/mosaic/keyframes", STRIPS)[1][0]
+    expected = transform_points(preview_from_world(), keyframes()[1])
+    np.testing.assert_allclose(quads[1][:4], expected, atol=1e-3)
+    centres = [np.mean(quad[:4], axis=0) for quad in quads]
+    (link,) = rrd_columns(recorded, "/mosaic/links", STRIPS)[1][0]
+    (loop,) = rrd_columns(recorded, "/mosaic/loops", STRIPS)[1][0]
+    np.testing.assert_allclose(link, centres, atol=1e-3)
+    np.testing.assert_allclose(loop, centres[::-1], atol=1e-3)
+
+
+def test_paths_follow_the_targets_and_the_adjusted_keyframes(recorded):
+    frames, paths = rrd_columns(recorded, "/mosaic/targets/board/path", STRIPS)
+    paths = dict(zip(frames, paths, strict=True))
+    seen = [index for index in range(26) if not 10 <= index < 15]
+    centres = [
+        transform_points(pose(index), tracked("board", index).quad.mean(axis=0)[None])[0]
+        for index in seen
+    ]
+    expected = transform_points(preview_from_world(), centres)
+    np.testing.assert_allclose(paths[25][0], expected, atol=0.01)
+    moved = np.array(paths[50][0])[: len(expected)]
+    np.testing.assert_allclose(moved[1:], expected[1:] + 20.0, atol=0.01)  # 40 px at half size
+    frames, places = rrd_columns(recorded, "/mosaic/targets/board/position", "Points2D:positions")
+    places = dict(zip(frames, places, strict=True))
+    np.testing.assert_allclose(places[20][0], expected[seen.index(20)], atol=0.01)
+    assert places[30] == []
+
+
+def test_states_and_their_reasons(recorded):
+    states = rrd_columns(recorded, "/mosaic/state", "StateChange:state")
+    assert states == ([0, 10, 15], [["placed"], ["lost"], ["placed"]])
+    lines = [line for (line,) in rrd_columns(recorded, "/log", "TextLog:text")[1]]
+    assert "frame 10: mosaic lost: too few inliers" in lines
+
+
+def test_each_file_has_the_mosaic(tmp_path):
+    settings = build_settings({"recording": {"video": "jpeg", "rotate": "1s"}})
+    with Recorder(tmp_path / "a.rrd", source(), settings, ["board"], has_mosaic=True) as recorder:
+        for index in range(50):
+            log_mosaic(recorder, index)
+    for path in sorted(tmp_path.glob("*.rrd")):
+        first = 25 * (int(path.stem[-6:]) - 1)
+        assert rrd_columns(path, "/mosaic/image", BLOB)[0][0] == first
+        assert rrd_columns(path, "/mosaic/state", "StateChange:state")[0] == [first]
+        assert rrd_columns(path, "/mosaic/frame", "LineStrips2D:colors", None)[1]
+
+
+def test_a_large_mosaic_is_recorded_small(tmp_path):
+    path = tmp_path / "large.rrd"
+    with Recorder(path, source(), Settings(), [], has_mosaic=True) as recorder:
+        for second in range(4):
+            recorder.log(step_of(25 * second, ()))
+            assert recorder.is_mosaic_due(float(second))
+            recorder.log_mosaic(mosaic_view(width=3000), 25 * second, float(second))
+            assert not recorder.is_mosaic_due(second + 0.5)
+    pictures = [blob(one) for one in rrd_columns(path, "/mosaic/image", BLOB)[1]]
+    assert cv2.imdecode(np.frombuffer(pictures[0], np.uint8), 1).shape[1] == 768
+    assert all(len(data) < 600_000 for data in pictures)
+
+
+def features(count):
+    rng = np.random.default_rng(2)
+    points = rng.uniform(0, 100, (count, 2)).astype(np.float32)
+    ones = np.ones(count, np.float32)
+    return Features(points, ones, ones, np.zeros((count, 64), np.uint8))
+
+
+def link_of(a, b, verdict=Verdict.OK, count=12):
+    points = features(count).points
+    is_inlier = np.arange(count) % 3 > 0
+    b_from_a = translation(-40, 0) if verdict is Verdict.OK else None
+    found = Registration(
+        verdict, b_from_a, Model.TRANSLATION if b_from_a is not None else None, is_inlier, 0.5
+    )
+    rows = np.arange(count)
+    matches = Matches(rows, rows, np.ones(count, np.float32))
+    return Link(a, b, points, points - np.float32([40, 0]), found, matches, 0.5, 0.9)
+
+
+def pictures_and_placements():
+    pictures = [Picture(i, f"p {i}.jpg", picture(40 * i), features(9)) for i in range(3)]
+    pictures[1] = Picture(1, "grey.png", cv2.cvtColor(picture(40), 6), features(0))
+    placements = [
+        Placement(0, "p 0.jpg", 9, Status.USED, "", np.eye(3)),
+        Placement(1, "grey.png", 0, Status.USED, "", translation(40, 0)),
+        Placement(2, "p 2.jpg", 9, Status.SKIPPED, "no overlap with the others"),
+        Placement(3, "broken.jpg", 0, Status.SKIPPED, "cannot be read"),
+    ]
+    return pictures, placements
+
+
+def test_a_mosaic_of_pictures(tmp_path):
+    path = tmp_path / "new" / "pictures.rrd"
+    pictures, placements = pictures_and_placements()
+    links = [link_of(0, 1), link_of(1, 2, Verdict.TOO_FEW_INLIERS), link_of(0, 2, count=0)]
+    mosaic = np.full((130, 230, 3), 90, np.uint8)
+    record_picture_mosaic(
+        path, pictures, links, placements, mosaic, translation(-5, -6), "# Mosaic"
+    )
+    shown = rrd_columns(path, "/mosaic/image", BLOB, None)[1]
+    assert cv2.imdecode(np.frombuffer(blob(shown[0]), np.uint8), 1).shape == (130, 230, 3)
+    (outlines,) = rrd_columns(path, "/mosaic/outlines", STRIPS, None)[1]
+    np.testing.assert_allclose(outlines[1][0], [45, 6], atol=1e-4)
+    assert rrd_columns(path, "/mosaic/outlines", "LineStrips2D:labels", None)[1] == [
+        ["p 0.jpg", "grey.png"]
+    ]
+    assert len(rrd_columns(path, "/pictures/2/keypoints", "Points2D:positions", None)[1][0]) == 9
+    (lines,) = rrd_columns(path, "/links/0-1/matches", STRIPS, None)[1]
+    (classes,) = rrd_columns(path, "/links/0-1/matches", "LineStrips2D:class_ids", None)[1]
+    assert classes == [2] * 4 + [1] * 8  # agreeing ones are drawn last
+    start, end = np.array(lines[-1])
+    np.testing.assert_allclose(end - start, [SIZE[0] + 8 - 40, 0], atol=1e-3)
+    assert {"/links/1-2/matches", "/links/0-2/image"} <= set(rrd_entities(path))
+    log = [line for (line,) in rrd_columns(path, "/log", "TextLog:text", "picture")[1]]
+    assert "p 2.jpg: skipped: no overlap with the others" in log
+    assert "broken.jpg: skipped: cannot be read" in log
+    assert "1 - 2: 12 matches, refused (too few inliers), 8 of 12 agree" in log
+    assert rrd_columns(path, "/summary", "TextDocument:text", None)[1] == [["# Mosaic"]]
+    assert RrdReader(path).blueprints()
+
+
+def test_many_links_are_bounded(tmp_path):
+    path = tmp_path / "many.rrd"
+    pictures = [Picture(i, f"{i}", picture(i), features(4)) for i in range(14)]
+    links = [link_of(a, b, count=3 + a) for a in range(14) for b in range(a + 1, 14)]
+    mosaic = np.zeros((3000, 20, 3), np.uint8)
+    record_picture_mosaic(path, pictures, links, [], mosaic, np.eye(3), "")
+    shown = {name for name in rrd_entities(path) if name.startswith("/links/") and "image" in name}
+    assert len(shown) == 48
+    assert "/links/12-13/image" in shown
+    log = [line for (line,) in rrd_columns(path, "/log", "TextLog:text", "picture")[1]]
+    assert f"{len(links) - 48} of {len(links)} links are not shown as pictures" in log
+
+
+def test_an_unwritable_place_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    pictures, placements = pictures_and_placements()
+    with pytest.raises(OutputError, match="recording"):
+        record_picture_mosaic(
+            tmp_path / "file" / "x.rrd", pictures, [], placements, picture(0), np.eye(3), ""
+        )

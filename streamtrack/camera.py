@@ -17,6 +17,7 @@ import numpy as np
 
 from streamtrack import geometry
 from streamtrack.fitting import fit
+from streamtrack.fixed_camera import FixedCamera
 from streamtrack.frame_view import FrameView
 from streamtrack.keyframes import KeyframeGraph
 from streamtrack.loops import LevelCache, LoopCloser, NewKeyframe, link_of, overlapping
@@ -24,13 +25,8 @@ from streamtrack.mosaic.types import Link
 from streamtrack.relocalising import Relocaliser
 from streamtrack.settings import Settings
 from streamtrack.types import CameraPose, Matrix, Model, Points, Size, Track, Verdict
-from streamtrack.view_alignment import (
-    ReferenceView,
-    ViewAlignment,
-    ViewLevels,
-    align,
-    align_exactly,
-)
+from streamtrack.view_alignment import ViewAlignment, align, align_exactly
+from streamtrack.view_levels import ReferenceView, ViewLevels
 
 _MIN_OVERLAP = 0.6
 _MIN_OVERLAP_UNSHARP = 0.45  # below which a blurred frame, too, becomes a keyframe
@@ -44,6 +40,8 @@ _MAX_AREA_JUMP = 1.5
 _MAX_STRETCH = 4.0
 _MAX_STEPS_AHEAD = 8
 _REFERENCES_KEPT = 6
+_STILL_PX = 2.0
+_STILL_FRAMES = 25
 
 
 class CameraEstimator(Protocol):
@@ -61,14 +59,59 @@ def make_camera(settings: Settings, *, is_live: bool = False) -> CameraEstimator
     """
     if settings.camera == "moving":
         return MovingCamera(settings, is_threaded=is_live)
+    if settings.camera == "auto":
+        return AutoCamera(settings, is_threaded=is_live)
     return FixedCamera()
 
 
-class FixedCamera:
-    """A camera on a tripod: the world is the picture."""
+class AutoCamera:
+    """Finds out whether the camera stands or moves, and goes on as the one or the other.
+
+    It moves until it has stood for a while; a camera that stands and is found elsewhere at two
+    checks, each time somewhere else, moves after all.
+    """
+
+    def __init__(self, settings: Settings, *, is_threaded: bool = False) -> None:
+        self._moving = MovingCamera(settings, is_threaded=is_threaded)
+        self._fixed = FixedCamera()
+        self._frames_still = 0
+        self._last_moved_px = 0.0
+        self.is_fixed = False
+
+    @property
+    def graph(self) -> KeyframeGraph:
+        """The keyframes; one alone as long as the camera stands."""
+        return self._moving.graph
 
     def update(self, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
-        return CameraPose(np.eye(3))
+        """The camera's pose in the next frame: just the identity while it stands."""
+        fixed = self._fixed.update(view, tracks)
+        if self.is_fixed and not self._is_off():
+            return fixed
+        self.is_fixed = False
+        pose = self._moving.update(view, tracks)
+        world_from_frame = pose.world_from_frame
+        if world_from_frame is not None:
+            quad = geometry.image_quad(view.size_wh)
+            off_px = float(np.max(np.abs(geometry.transform_points(world_from_frame, quad) - quad)))
+            self._frames_still = self._frames_still + 1 if off_px < _STILL_PX else 0
+        self.is_fixed = self._frames_still >= _STILL_FRAMES
+        if self.is_fixed:
+            self._frames_still, self._last_moved_px = 0, self._fixed.moved_px
+        return pose
+
+    def close(self) -> None:
+        """Finish the work on loops."""
+        self._moving.close()
+
+    def _is_off(self) -> bool:
+        """True if the camera went on moving between two checks: nobody just bumped it once."""
+        moved_px = self._fixed.moved_px
+        if abs(moved_px - self._last_moved_px) <= _STILL_PX:
+            return False
+        is_off = self._last_moved_px > _STILL_PX
+        self._last_moved_px = moved_px
+        return is_off
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +160,7 @@ class MovingCamera:
         if state is None:
             return self._begin(view, levels, hidden)
         if levels.is_flat():
-            return CameraPose(None, reason=Verdict.TOO_FEW_FEATURES)
+            return CameraPose(None, reason=str(Verdict.TOO_FEW_FEATURES))
         found = self._follow(state, view, levels, hidden)
         keyframe = state.keyframe
         if found.reference_from_view is None:
@@ -136,7 +179,7 @@ class MovingCamera:
         reference = ReferenceView(levels, hidden)
         cells = reference.textured_cells
         if cells < _MIN_TEXTURED_CELLS:
-            return CameraPose(None, reason=Verdict.TOO_FEW_FEATURES)
+            return CameraPose(None, reason=str(Verdict.TOO_FEW_FEATURES))
         self._take(view, reference, np.eye(3), None)
         self._state = _State(view.frame.index, np.eye(3), view.frame.time_s, None, 0.0)
         return CameraPose(np.eye(3), cells, cells, 0.0, keyframe=view.frame.index, is_keyframe=True)
@@ -181,7 +224,7 @@ class MovingCamera:
         world_from_frame = geometry.normalized(world_from_keyframe @ keyframe_from_frame)
         self._remember(view, keyframe, keyframe_from_frame)
         if _stretch(world_from_frame, view.size_wh) > _MAX_STRETCH:
-            return CameraPose(None, matches, found.inliers, found.rmse_px, Verdict.STRETCHED)
+            return CameraPose(None, matches, found.inliers, found.rmse_px, str(Verdict.STRETCHED))
         self.graph.add_frame(index, keyframe, keyframe_from_frame)
         is_keyframe = False
         if self._has_moved_on(found, view, keyframe):
@@ -303,7 +346,8 @@ class MovingCamera:
 
 
 def _refused(found: ViewAlignment) -> CameraPose:
-    return CameraPose(None, len(found.is_inlier), found.inliers, reason=found.verdict)
+    reason = str(found.verdict).replace("the target", "the keyframe").replace("target", "view")
+    return CameraPose(None, len(found.is_inlier), found.inliers, reason=reason)
 
 
 def _without_jump(found: ViewAlignment, guess: Matrix, size_wh: Size) -> ViewAlignment:

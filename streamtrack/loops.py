@@ -23,13 +23,8 @@ from streamtrack.keyframes import Keyframe, KeyframeGraph
 from streamtrack.mosaic.adjustment import adjust
 from streamtrack.mosaic.types import Link
 from streamtrack.types import Matches, Matrix, Model, Registration, Size
-from streamtrack.view_alignment import (
-    ReferenceView,
-    ViewAlignment,
-    ViewLevels,
-    align,
-    align_exactly,
-)
+from streamtrack.view_alignment import ViewAlignment, align, align_exactly
+from streamtrack.view_levels import ReferenceView, ViewLevels
 
 _MIN_LINK_OVERLAP = 0.25
 _MAX_NEIGHBOURS = 1  # taken shortly before, beside the one that the keyframe was measured against

@@ -16,7 +16,7 @@ from streamtrack.matching import match
 from streamtrack.registration import register
 from streamtrack.settings import FeatureSettings, Settings
 from streamtrack.types import Features, Matrix
-from streamtrack.view_alignment import USUAL, ViewLevels
+from streamtrack.view_levels import USUAL, ViewLevels
 
 _FEATURES = 500
 _KEYFRAMES_A_FRAME = 3

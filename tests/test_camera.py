@@ -10,12 +10,14 @@ import pytest
 from conftest import Clip, FrameList, MakePicture
 
 from streamtrack import geometry
+from streamtrack.camera import AutoCamera, MovingCamera, make_camera
 from streamtrack.evaluation import corner_error
 from streamtrack.features import FeatureExtractor
+from streamtrack.frame_view import FrameView
 from streamtrack.pipeline import track
 from streamtrack.settings import build_settings
 from streamtrack.targets import Target
-from streamtrack.types import CameraPose, Frame, Image, Matrix
+from streamtrack.types import CameraPose, Frame, Image, Matrix, Track, TrackState
 
 MakeClip = Callable[..., Clip]
 SIZE = (320, 240)
@@ -183,3 +185,158 @@ def test_a_zoom_and_turn_of_a_picture_is_recovered(make_picture: MakePicture) ->
     for pose, frame_from_wide in zip(found, truths, strict=True):
         truth = truths[0] @ geometry.inverted(frame_from_wide)
         assert corner_error(pose.world_from_frame, truth, SIZE) < 0.6
+
+
+@pytest.mark.parametrize("at", [1, 5, 9])
+def test_a_frozen_frame_leaves_no_trace(at: int, make_clip: MakeClip) -> None:
+    """The picture of the frame before, shown twice, has its pose, and the motion goes on."""
+    clip = make_clip(FLIGHT, 12)
+    frozen = poses(clip.with_images({at: clip.frames[at - 1].image}))
+    check_contract(frozen)
+    assert corner_error(frozen[at].world_from_frame, true_poses(clip)[at - 1], SIZE) < 0.5
+    assert max(error for i, error in enumerate(errors(frozen, clip)) if i != at) < 0.5
+
+
+def test_a_cut_is_noticed_and_the_return_from_it(
+    make_clip: MakeClip, make_picture: MakePicture
+) -> None:
+    """Another scene is never placed; back over the old one, the camera knows where it is."""
+    clip = make_clip("flight?size=320x240&frames=60&step=30", 22)
+    elsewhere = np.dstack([make_picture(21, SIZE)] * 3)
+    back = list(range(22)) + [22] * 6 + [3, 4, 5]
+    frames = [
+        Frame(n, n / 30, elsewhere if i == 22 else clip.frames[i].image) for n, i in enumerate(back)
+    ]
+    found = poses(FrameList(frames))
+    check_contract(found)
+    assert all(pose.world_from_frame is None for pose in found[22:28])
+    truths = true_poses(clip)
+    for n in range(29, 31):
+        assert corner_error(found[n].world_from_frame, truths[back[n]], SIZE) < 3.0
+
+
+@pytest.mark.parametrize("jump_px", [12, 25, 45])
+def test_a_jerk_is_followed(jump_px: int, make_picture: MakePicture) -> None:
+    wide = make_picture(13, (800, 400))
+    xs = [0, 2, 4, 6, 6 + jump_px, 8 + jump_px, 10 + jump_px]
+    frames = [
+        Frame(n, n / 30, np.ascontiguousarray(wide[40:280, 100 + x : 420 + x]))
+        for n, x in enumerate(xs)
+    ]
+    for pose, x in zip(poses(FrameList(frames)), xs, strict=True):
+        assert corner_error(pose.world_from_frame, geometry.translation(x, 0), SIZE) < 0.3
+
+
+@pytest.mark.parametrize("share", [0.2, 0.4])
+def test_things_that_move_are_left_out(share: float, make_picture: MakePicture) -> None:
+    """An object over a part of the view goes the other way; its quad is known."""
+    ground, thing = make_picture(14, (800, 400)), make_picture(15, SIZE)
+    side = share**0.5
+    width, height = round(320 * side), round(240 * side)
+    frames, quads = [], []
+    for n in range(10):
+        image = ground[60:300, 100 + 20 * n : 420 + 20 * n].copy()
+        x, y = 150 - 14 * n if width < 160 else 100 - 9 * n, 20
+        image[y : y + height, x : x + width] = thing[:height, :width]
+        frames.append(Frame(n, n / 30, image))
+        quads.append(geometry.box_quad(x, y, width, height))
+    settings = build_settings({"camera": "moving"})
+    camera, extractor = MovingCamera(settings), FeatureExtractor(settings.features)
+    for n, (frame, quad) in enumerate(zip(frames, quads, strict=True)):
+        thing_there = Track("t", TrackState.TRACKING, quad, np.eye(3))
+        pose = camera.update(FrameView(frame, extractor), (thing_there,))
+        assert corner_error(pose.world_from_frame, geometry.translation(20 * n, 0), SIZE) < 0.5
+
+
+def test_a_frame_that_would_cover_too_much_is_refused(make_picture: MakePicture) -> None:
+    """The camera backs away until its view is more than twice as wide as the first."""
+    wide = make_picture(16, (1280, 960))
+    frames, zooms = [], [1.0 + 0.08 * n for n in range(18)]
+    for n, zoom in enumerate(zooms):
+        wide_from_frame = np.array(
+            [[zoom, 0, 640 - 160 * zoom], [0, zoom, 480 - 120 * zoom], [0, 0, 1.0]]
+        )
+        image = cv2.warpPerspective(wide, geometry.inverted(wide_from_frame), SIZE)
+        frames.append(Frame(n, n / 30, np.asarray(image, np.uint8)))
+    found = poses(FrameList(frames))
+    check_contract(found)
+    for pose, zoom in zip(found, zooms, strict=True):
+        if zoom < 1.95:
+            assert pose.world_from_frame is not None
+        if zoom > 2.05:
+            assert pose.world_from_frame is None
+            assert "four times" in pose.reason
+
+
+def fixed_clip(make_picture: MakePicture, shifts: Sequence[tuple[int, int]]) -> FrameList:
+    """A view that lies elsewhere in its picture in each frame, with noise."""
+    wide = make_picture(17, (400, 300))
+    rng = np.random.default_rng(3)
+    frames = []
+    for n, (x, y) in enumerate(shifts):
+        noise = rng.normal(0, 2, (240, 320))
+        image = np.clip(wide[30 + y : 270 + y, 40 + x : 360 + x] + noise, 0, 255).astype(np.uint8)
+        frames.append(Frame(n, n / 30, image))
+    return FrameList(frames)
+
+
+def test_a_tripod_that_was_bumped_is_reported(make_picture: MakePicture) -> None:
+    shifts = [(0, 0)] * 60 + [(8, 6)] * 60
+    found = poses(fixed_clip(make_picture, shifts), "fixed")
+    for pose in found:
+        np.testing.assert_array_equal(pose.world_from_frame, np.eye(3))
+        assert pose.reason == ""
+    assert all(pose.warning == "" for pose in found[:60])
+    assert found[-1].warning.startswith("camera moved at frame 60 by ")
+    moved_px = float(found[-1].warning.split()[-2])
+    assert moved_px == pytest.approx(10, abs=0.5)
+
+
+def test_a_tripod_that_was_put_back_is_trusted_again(make_picture: MakePicture) -> None:
+    shifts = [(0, 0)] * 30 + [(9, 0)] * 40 + [(0, 0)] * 60
+    found = poses(fixed_clip(make_picture, shifts), "fixed")
+    assert any(pose.warning for pose in found[30:80])
+    assert found[-1].warning == ""
+
+
+def test_a_camera_that_stands_raises_no_alarm(make_clip: MakeClip) -> None:
+    clip = make_clip("board?size=320x240", 90)
+    assert {pose.warning for pose in poses(clip.source(), "fixed")} == {""}
+
+
+def test_another_view_than_at_first_is_reported(make_picture: MakePicture) -> None:
+    clip = fixed_clip(make_picture, [(0, 0)] * 30)
+    other = np.asarray(make_picture(18, SIZE), np.uint8)
+    frames = [*clip, *(Frame(n, n / 30, other) for n in range(30, 130))]
+    assert poses(FrameList(frames), "fixed")[-1].warning.startswith("view not recognised since")
+
+
+def test_auto_finds_out_that_a_camera_stands(make_picture: MakePicture) -> None:
+    camera, found = run_auto(fixed_clip(make_picture, [(0, 0)] * 60))
+    assert camera.is_fixed
+    np.testing.assert_array_equal(found[-1].world_from_frame, np.eye(3))
+    assert max(corner_error(pose.world_from_frame, np.eye(3), SIZE) for pose in found) < 0.2
+
+
+def test_auto_finds_out_that_a_camera_moves(make_clip: MakeClip) -> None:
+    clip = make_clip(FLIGHT, 16)
+    camera, found = run_auto(clip.source())
+    assert not camera.is_fixed
+    assert max(errors(found, clip)) < 0.5
+
+
+def test_auto_notices_that_a_camera_begins_to_move(make_picture: MakePicture) -> None:
+    shifts = [(0, 0)] * 40 + [(min(39, n), 0) for n in range(110)]
+    camera, found = run_auto(fixed_clip(make_picture, shifts))
+    assert not camera.is_fixed or found[-1].warning
+    x, y = shifts[-1]
+    assert corner_error(found[-1].world_from_frame, geometry.translation(x, y), SIZE) < 0.5
+
+
+def run_auto(source: FrameList) -> tuple[AutoCamera, list[CameraPose]]:
+    settings = build_settings({"camera": "auto"})
+    camera, extractor = make_camera(settings), FeatureExtractor(settings.features)
+    assert isinstance(camera, AutoCamera)
+    found = [camera.update(FrameView(frame, extractor), ()) for frame in source]
+    camera.close()
+    return camera, found

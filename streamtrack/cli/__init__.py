@@ -23,7 +23,7 @@ __all__ = ["app", "exit_on_error", "main"]
 
 app = typer.Typer(
     name="streamtrack",
-    help="Track objects in video by local features and homographies; see why in Rerun.",
+    help="Track objects in video, build mosaics of what the camera saw; see why in Rerun.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -43,6 +43,8 @@ def main() -> None:
     os.environ.setdefault("RUST_LOG", "off")
     # Its allocator shall hand memory back at once: runs last for weeks.
     os.environ.setdefault("MIMALLOC_PURGE_DELAY", "0")
+    # Its matrices are small: threads for them only wait for each other, at full speed.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     exit_on_error(lambda: app(standalone_mode=False))
 
 
@@ -90,4 +92,4 @@ def _common(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """Track objects in video by local features and homographies; see why in Rerun."""
+    """Track objects in video, build mosaics of what the camera saw; see why in Rerun."""

@@ -12,6 +12,7 @@ from streamtrack.mosaic.gains import GainEdge, solve_gains
 from streamtrack.mosaic.seams import SmallPatch
 
 _MIN_OVERLAP_PX = 60
+_ENOUGH_PX = 8000  # every other pixel of a larger overlap tells as much
 _DARK, _BRIGHT = 8, 247
 Doubles = npt.NDArray[np.float64]
 
@@ -29,6 +30,8 @@ def compensation_gains(
     for a, b, image_a, image_b, both in _overlaps(patches):
         if pictures[a] == pictures[b]:
             continue
+        if both.size > _ENOUGH_PX:
+            image_a, image_b, both = (part[::2, ::2] for part in (image_a, image_b, both))
         low = np.minimum(image_a, image_b).min(axis=2)
         high = np.maximum(image_a, image_b).max(axis=2)
         fit = both & (low > _DARK) & (high < _BRIGHT)

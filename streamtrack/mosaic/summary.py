@@ -188,7 +188,11 @@ class MosaicSummary:
             *self._image_rows(),
             ("Mosaic", self._canvas_text()),
         ]
-        rows += [(key.replace("_", " ").capitalize(), str(v)) for key, v in self.more.items()]
+        rows += [
+            (key.replace("_", " ").capitalize(), str(value))
+            for key, value in self.more.items()
+            if not key.endswith("_definition")
+        ]
         rows += [("Note", note) for note in self.notes]
         if self.ms_per_frame is not None:
             rows.append(("Time a frame", f"{self.ms_per_frame:.1f} ms"))
@@ -219,14 +223,17 @@ class MosaicSummary:
         if len(self.links) == 1:
             return _link_rows(self.links[0], features, threshold_px)
         counts = list(features.values())
-        rows = [("Features", f"{min(counts)} to {max(counts)} a picture" if counts else "-")]
+        rows = []
+        if any(counts):  # a stream that is followed by grey values detects none
+            rows.append(("Features", f"{min(counts)} to {max(counts)} a picture"))
         refused = Counter(link.verdict for link in self.links if link.verdict != "ok")
         text = f"{len(good)} accepted"
         if refused:
             text += "; refused: " + ", ".join(f"{why} {n}" for why, n in refused.most_common())
         rows.append(("Links", text))
         if good:
-            rows.append(("Matches", _range_text([link.matches for link in good], " a link")))
+            if any(link.matches for link in good):
+                rows.append(("Matches", _range_text([link.matches for link in good], " a link")))
             rows.append(("Inliers", _range_text([link.inliers for link in good], " a link")))
         return rows
 

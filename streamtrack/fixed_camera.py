@@ -1,0 +1,125 @@
+"""A camera on a tripod: the world is the picture, and whether that is still so is checked.
+
+Now and then a frame is aligned with the first one, at reduced resolution. If its corners have
+moved, the frames since the check before are gone through for the first that had. The pose stays
+the identity all the same, as it is what was asked for; its ``warning`` says what is wrong.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from streamtrack import geometry
+from streamtrack.frame_view import FrameView
+from streamtrack.types import CameraPose, Frame, Image, Points, Track
+from streamtrack.view_alignment import align
+from streamtrack.view_levels import ReferenceView, ViewLevels
+
+_EVERY = 25  # frames between two checks
+_LONGEST_PX = 320
+_MOVED_PX = 1.5
+_MIN_TEXTURED_CELLS = 12
+_UNKNOWN_CHECKS = 3  # in a row that recognise nothing, before it is said
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Small:
+    """A frame at reduced resolution, with what moves of itself in it."""
+
+    index: int
+    image: Image
+    hidden: tuple[Points, ...]
+
+
+class FixedCamera:
+    """A camera that stands; ``every`` says how many frames lie between two checks."""
+
+    def __init__(self, every: int = _EVERY) -> None:
+        self._every = every
+        self._reference: ReferenceView | None = None
+        self._recent: deque[_Small] = deque(maxlen=every)
+        self._frames = 0
+        self._unknown = 0
+        self._unknown_since = 0
+        self._warning = ""
+        self.moved_px = 0.0
+        """How far the corner that moved most is from where it was, by the last check."""
+
+    def update(self, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
+        """The identity; ``tracks`` are the targets, whose places are left out of the check."""
+        step = _step(view.frame)
+        hidden = tuple(track.quad / np.float32(step) for track in tracks if track.quad is not None)
+        small = _Small(view.frame.index, _reduced(view, step), hidden)
+        if self._reference is None:
+            self._start(small)
+        else:
+            self._recent.append(small)
+            self._frames += 1
+            if self._frames % self._every == 0:
+                self._check(small, step)
+        return CameraPose(np.eye(3), warning=self._warning)
+
+    def _start(self, small: _Small) -> None:
+        levels = ViewLevels(small.image)
+        reference = ReferenceView(levels, small.hidden)
+        if not levels.is_flat() and reference.textured_cells >= _MIN_TEXTURED_CELLS:
+            self._reference = reference
+
+    def _check(self, small: _Small, step: int) -> None:
+        moved_px = self._moved_px(small, step)
+        if moved_px is None:
+            self._unknown += 1
+            if self._unknown == 1:
+                self._unknown_since = small.index
+            if self._unknown >= _UNKNOWN_CHECKS:
+                self._warning = f"view not recognised since frame {self._unknown_since}"
+            return
+        self._unknown = 0
+        self.moved_px = moved_px
+        if moved_px <= _MOVED_PX:
+            self._warning = ""
+        elif not self._warning.startswith("camera moved"):
+            first = self._first_moved(step, max(_MOVED_PX, moved_px / 2))
+            self._warning = f"camera moved at frame {first} by {moved_px:.1f} px"
+
+    def _first_moved(self, step: int, limit_px: float) -> int:
+        """Index of the first of the last frames that lies as far off, by halving."""
+        frames = list(self._recent)
+        low, high = 0, len(frames) - 1
+        while low < high:
+            middle = (low + high) // 2
+            moved_px = self._moved_px(frames[middle], step)
+            if moved_px is not None and moved_px > limit_px:
+                high = middle
+            else:
+                low = middle + 1
+        return frames[high].index
+
+    def _moved_px(self, small: _Small, step: int) -> float | None:
+        """How far the frame's corners are from the first frame's, None if it shows another view."""
+        assert self._reference is not None
+        if (small.image.shape[1], small.image.shape[0]) != self._reference.size_wh:
+            return None
+        levels = ViewLevels(small.image)
+        found = align(self._reference, levels, np.eye(3), small.hidden)
+        if found.reference_from_view is None:
+            found = align(self._reference, levels, np.eye(3), small.hidden, is_searched=True)
+        if found.reference_from_view is None:
+            return None
+        quad = geometry.image_quad(levels.size_wh)
+        off = geometry.transform_points(found.reference_from_view, quad) - quad
+        uncertain_px = 2 * found.corner_sigma_px
+        return max(0.0, float(np.max(np.hypot(off[:, 0], off[:, 1]))) - uncertain_px) * step
+
+
+def _step(frame: Frame) -> int:
+    return max(1, round(max(frame.size_wh) / _LONGEST_PX))
+
+
+def _reduced(view: FrameView, step: int) -> Image:
+    """Every ``step``-th grey pixel: coarse, but it costs next to nothing in every frame."""
+    return np.ascontiguousarray(view.grey[::step, ::step])

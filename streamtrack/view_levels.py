@@ -1,0 +1,168 @@
+"""One view at several resolutions, and the textured pixels by which others are aligned with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from streamtrack import geometry
+from streamtrack.types import Image, Matrix, Points, Size
+
+Floats: TypeAlias = npt.NDArray[np.float32]
+Rows: TypeAlias = npt.NDArray[np.intp]
+
+EXACT, USUAL = 0, 1  # levels: the one for links between keyframes, and the finest for frames
+_LONGEST_PX = (1024, 512)  # side of these two levels
+_COARSEST_PX = 40
+_MAX_LEVELS = 5
+_CELLS = (12, 9)
+_CELL_PIXELS = (180, 44, 20, 12, 8)  # chosen of each cell, by level
+_HIGH_PASS_PX = 25
+EDGE_PX = 3
+_MIN_GRADIENT = 0.8  # grey levels a pixel, RMS of a cell's chosen pixels
+
+
+class ViewLevels:
+    """One view (H, W) in grey at halved resolutions, each high-passed when first needed.
+
+    The levels `EXACT` and `USUAL` are one for small pictures.
+    """
+
+    def __init__(self, grey: Image) -> None:
+        self.size_wh: Size = (grey.shape[1], grey.shape[0])
+        exact = _halved_to(grey, _LONGEST_PX[EXACT])
+        levels = [exact, _halved_to(exact, _LONGEST_PX[USUAL])]
+        while len(levels) < _MAX_LEVELS and max(levels[-1].shape) // 2 >= _COARSEST_PX:
+            levels.append(_halved(levels[-1]))
+        self.images: tuple[Image, ...] = tuple(levels)
+        self._high_passed: dict[int, Floats] = {}
+
+    @property
+    def usual(self) -> Image:
+        """The picture at the level at which frames are followed."""
+        return self.images[USUAL]
+
+    def level_from_view(self, level: int) -> Matrix:
+        """Pixels of the full view to pixels of a level."""
+        height, width = self.images[level].shape
+        return geometry.scaling(width / self.size_wh[0], height / self.size_wh[1])
+
+    def high_passed(self, level: int) -> Floats:
+        """Grey values, slightly smoothed, minus their local mean."""
+        if self.images[level] is self.images[USUAL]:
+            level = USUAL
+        found = self._high_passed.get(level)
+        if found is None:
+            smooth = cv2.GaussianBlur(self.images[level], (3, 3), 0.8).astype(np.float32)
+            window = (_HIGH_PASS_PX, _HIGH_PASS_PX)
+            found = np.asarray(smooth - cv2.blur(smooth, window), np.float32)
+            if level != EXACT:  # large, and needed once or twice
+                self._high_passed[level] = found
+        return found
+
+    def is_flat(self) -> bool:
+        """True if the view shows next to nothing: black, white, fog."""
+        return float(self.high_passed(len(self.images) - 1).std()) < 1.0
+
+
+def _halved(image: Image) -> Image:
+    size = max(1, image.shape[1] // 2), max(1, image.shape[0] // 2)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _halved_to(image: Image, longest_px: int) -> Image:
+    while max(image.shape) > longest_px:
+        image = _halved(image)
+    return image
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pixels:
+    """The chosen pixels of one level of a keyframe.
+
+    points     float32 (3, N), level pixels, with ones
+    values     float32 (N,), high-passed grey values
+    jacobian   float32 (N, 8), change of a value with each parameter of a homography in units
+    cell       int (N,), the cell each lies in, rising
+    """
+
+    points: Floats
+    values: Floats
+    jacobian: Floats
+    cell: Rows
+    unit_from_level: Matrix
+
+
+class ReferenceView:
+    """A view that others are aligned with: its textured pixels at every level."""
+
+    def __init__(self, levels: ViewLevels, hidden: Sequence[Points] = ()) -> None:
+        """``hidden`` are quads (4, 2) in the view that do not belong to the scene."""
+        self.levels = levels
+        self.size_wh = levels.size_wh
+        self._hidden = tuple(hidden)
+        self._pixels: dict[int, Pixels] = {}
+
+    @property
+    def textured_cells(self) -> int:
+        """Cells that hold enough texture to be judged."""
+        return len(np.unique(self.pixels(USUAL).cell))
+
+    def pixels(self, level: int) -> Pixels:
+        """The chosen pixels of a level, chosen when first asked for."""
+        if level not in self._pixels:
+            self._pixels[level] = _choose_pixels(self.levels, level, self._hidden)
+        return self._pixels[level]
+
+
+def _choose_pixels(levels: ViewLevels, level: int, hidden: Sequence[Points]) -> Pixels:
+    values = levels.high_passed(level)
+    gx = np.asarray(cv2.Sobel(values, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8), np.float32)
+    gy = np.asarray(cv2.Sobel(values, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8), np.float32)
+    strength = np.asarray(gx * gx + gy * gy, np.float32)
+    strength[:EDGE_PX] = strength[-EDGE_PX:] = 0
+    strength[:, :EDGE_PX] = strength[:, -EDGE_PX:] = 0
+    for quad in hidden:
+        seen = geometry.transform_points(levels.level_from_view(level), quad)
+        if np.isfinite(seen).all():
+            outline = np.rint(np.clip(seen, -1e6, 1e6)).astype(np.int32)
+            cv2.fillConvexPoly(strength, outline, 0.0)
+    row, column, cell = _strongest(strength, _CELL_PIXELS[level])
+    height, width = values.shape
+    unit = 2.0 / max(width, height)
+    unit_from_level = np.array(
+        [[unit, 0, -unit * (width - 1) / 2], [0, unit, -unit * (height - 1) / 2], [0, 0, 1]]
+    )
+    points = np.stack([column, row, np.ones_like(row)]).astype(np.float32)
+    x, y = column * unit + unit_from_level[0, 2], row * unit + unit_from_level[1, 2]
+    u, v = gx[row, column] / unit, gy[row, column] / unit
+    radial = u * x + v * y
+    parts = [u * x, u * y, u, v * x, v * y, v, -x * radial, -y * radial]
+    jacobian = np.stack(parts, axis=1).astype(np.float32)
+    return Pixels(points, values[row, column], jacobian, cell, unit_from_level)
+
+
+def _strongest(strength: Floats, count: int) -> tuple[Rows, Rows, Rows]:
+    """Row, column and cell of the ``count`` strongest pixels of every cell that has texture."""
+    height, width = strength.shape
+    across, down = _CELLS
+    cell_w, cell_h = -(-width // across), -(-height // down)
+    padded = np.zeros((down * cell_h, across * cell_w), np.float32)
+    padded[:height, :width] = strength
+    cells = padded.reshape(down, cell_h, across, cell_w).swapaxes(1, 2).reshape(down * across, -1)
+    count = min(count, cells.shape[1])
+    best = np.argpartition(-cells, count - 1, axis=1)[:, :count]
+    best.sort(axis=1)
+    chosen = np.take_along_axis(cells, best, axis=1)
+    is_textured = chosen.mean(axis=1) >= _MIN_GRADIENT**2
+    cell = np.broadcast_to(np.arange(len(cells))[:, None], best.shape)
+    kept = (chosen > 0) & is_textured[:, None]
+    within, cell = best[kept], cell[kept]
+    row = (cell // across) * cell_h + within // cell_w
+    column = (cell % across) * cell_w + within % cell_w
+    return row.astype(np.intp), column.astype(np.intp), cell.astype(np.intp)

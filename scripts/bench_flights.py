@@ -5,7 +5,8 @@
 Several photographs are laid side by side in rows. A virtual camera flies a rounded rectangle over
 them and comes back to its start, with rotation of 6 degrees and zoom of 8 per cent either way,
 slight perspective, noise of sigma 2 and gain of 8 per cent either way. Errors are mean distances
-of a frame's four corners from the truth, in pixels of the first frame, which is the world; nothing is aligned afterwards.
+of a frame's four corners from the truth, in pixels of the first frame, which is the world; nothing
+is aligned afterwards.
 """
 
 from __future__ import annotations

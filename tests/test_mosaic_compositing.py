@@ -38,7 +38,7 @@ def painted(
     poses = {i: geometry.translation(*place) for i, place in places.items()}
     views = planar_views(poses, dict.fromkeys(poses, SIZE))
     canvas = lay_out(views, 1.0)
-    planned = plan(canvas, pictures, settings)
+    planned = plan(canvas, pictures, {}, settings)
     bands = list(painted_bands(planned, pictures.__getitem__, settings, lambda: None))
     return np.concatenate(bands), canvas
 

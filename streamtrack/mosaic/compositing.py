@@ -42,7 +42,8 @@ class Plan:
     """What is known before the canvas is painted.
 
     ``seams`` are the small masks of `Canvas.patches`, None where pictures are simply averaged;
-    ``small`` is the small canvas they belong to.
+    ``small`` is the small canvas they belong to. ``covers`` (H, W) tell where pictures with
+    transparency are opaque.
     """
 
     canvas: Canvas
@@ -50,15 +51,24 @@ class Plan:
     seams: tuple[Image, ...] | None
     gains: dict[int, npt.NDArray[np.float64]]
     overlap_ncc: float
+    covers: Mapping[int, Image]
 
 
-def plan(canvas: Canvas, thumbnails: Mapping[int, Image], settings: MosaicSettings) -> Plan:
-    """Seams, gains and agreement of a canvas from ``thumbnails``, small copies of the pictures."""
+def plan(
+    canvas: Canvas,
+    thumbnails: Mapping[int, Image],
+    covers: Mapping[int, Image],
+    settings: MosaicSettings,
+) -> Plan:
+    """Seams, gains and agreement of a canvas from ``thumbnails``, small copies of the pictures.
+
+    ``covers`` are 0 where a picture with transparency shows nothing, by picture, in any size.
+    """
     area = sum((p.box[2] - p.box[0]) * (p.box[3] - p.box[1]) for p in canvas.patches)
     share = min(_SEAM_PX * len(canvas.patches), _MOST_SMALL_PX) / max(area, 1)
     factor = min(1.0, float(np.sqrt(share)))
     small = _small_canvas(canvas, factor)
-    patches = [_small_patch(patch, thumbnails) for patch in small.patches]
+    patches = [_small_patch(patch, thumbnails, covers) for patch in small.patches]
     gains = compensation_gains(patches, [patch.picture for patch in small.patches])
     evened = [
         replace(p, image=_brightened(p.image, gains[patch.picture]))
@@ -66,7 +76,7 @@ def plan(canvas: Canvas, thumbnails: Mapping[int, Image], settings: MosaicSettin
     ]
     wants_seams = settings.blending != "average"
     seams = tuple(seam_masks(evened, small.size_wh)) if wants_seams else None
-    return Plan(canvas, small, seams, gains, overlap_ncc(patches))
+    return Plan(canvas, small, seams, gains, overlap_ncc(patches), covers)
 
 
 def _small_canvas(canvas: Canvas, factor: float) -> Canvas:
@@ -86,12 +96,14 @@ def _small_canvas(canvas: Canvas, factor: float) -> Canvas:
     return Canvas((size[0], size[1]), tuple(patches), canvas.scale * factor)
 
 
-def _small_patch(patch: Patch, thumbnails: Mapping[int, Image]) -> SmallPatch:
+def _small_patch(
+    patch: Patch, thumbnails: Mapping[int, Image], covers: Mapping[int, Image]
+) -> SmallPatch:
     image = thumbnails[patch.picture]
     full_width, full_height = patch.view.size_wh
     height, width = image.shape[:2]
     view = patch.view.of_resized(width / full_width, height / full_height, (width, height))
-    warped, cover = warp(image, view, patch.box, "linear")
+    warped, cover = warp(image, view, patch.box, "linear", covers.get(patch.picture))
     return SmallPatch(_in_colour(warped), cover, patch.box)
 
 
@@ -168,7 +180,13 @@ def _painted(
         box = x0, max(y0, band[0]), x1, min(y1, band[1])
         if box[1] >= box[3]:
             continue
-        warped, cover = warp(read(patch.picture), patch.view, box, settings.warping)
+        warped, cover = warp(
+            read(patch.picture),
+            patch.view,
+            box,
+            settings.warping,
+            planned.covers.get(patch.picture),
+        )
         image = _brightened(_in_colour(warped), planned.gains[patch.picture])
         mask = cover if planned.seams is None else _full_mask(planned, row, box)
         own = np.asarray(cv2.bitwise_and(mask, cover), np.uint8)

@@ -15,7 +15,7 @@ from streamtrack.errors import SourceError
 from streamtrack.mosaic.registering import PictureRegistrar
 from streamtrack.mosaic.types import Picture
 from streamtrack.settings import Settings
-from streamtrack.sources.images import read_picture
+from streamtrack.sources.images import read_coverage, read_picture
 from streamtrack.types import Image, Matrix, Size, Skipped
 
 _log = logging.getLogger("streamtrack.mosaic")
@@ -57,7 +57,8 @@ class PictureSet:
 
     ``pictures`` hold reduced grey images with their features, ``small_from_full`` maps to their
     pixels from those of the files, whose sizes are ``full_sizes``; ``thumbnails`` are small copies
-    in colour. ``skipped`` could not be read.
+    in colour. ``covers`` (H, W) are 255 where a picture with transparency is opaque; opaque ones
+    have none. ``skipped`` could not be read.
     """
 
     paths: tuple[Path, ...]
@@ -66,6 +67,7 @@ class PictureSet:
     small_from_full: dict[int, Matrix] = field(default_factory=dict)
     full_sizes: dict[int, Size] = field(default_factory=dict)
     thumbnails: dict[int, Image] = field(default_factory=dict)
+    covers: dict[int, Image] = field(default_factory=dict)
     skipped: list[Skipped] = field(default_factory=list)
 
     def name(self, index: int) -> str:
@@ -103,11 +105,14 @@ def load_pictures(
             continue
         try:
             image = read_picture(path)
-        except SourceError as error:
+            opacity = read_coverage(path)
+        except (SourceError, OSError) as error:
             found.skipped.append(Skipped(index, path.name, str(error)))
             _log.warning("%s is left out: %s", path.name, error)
             continue
         found.cache.keep(index, image)
+        if opacity is not None and opacity.shape == image.shape[:2]:
+            found.covers[index] = np.asarray(opacity > 127, np.uint8) * np.uint8(255)
         found.full_sizes[index] = image.shape[1], image.shape[0]
         found.thumbnails[index] = _reduced(image, _THUMBNAIL_PX)
         small = _reduced(geometry.grey_of(image), most_px)

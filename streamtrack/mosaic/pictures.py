@@ -146,7 +146,7 @@ def _place_and_paint(
     _take_over_links(result, arrangement, found)
     canvas = _canvas(job, found, result.arrangement, 1 / reference_factor, result.notes)
     settings = job.settings.mosaic
-    planned = plan(canvas, found.thumbnails, settings)
+    planned = plan(canvas, found.thumbnails, found.covers, settings)
     result.overlap_ncc = planned.overlap_ncc
     if job.outputs.image is None:
         result.canvas = canvas

@@ -23,17 +23,20 @@ MOST_SIDE = 32_000
 """Longest side that OpenCV's warping takes (coordinates are 16-bit) is 32,767."""
 
 
-def warp(image: Image, view: View, box: Box, warping: Warping) -> tuple[Image, Image]:
+def warp(
+    image: Image, view: View, box: Box, warping: Warping, opaque: Image | None = None
+) -> tuple[Image, Image]:
     """The part of a picture that falls into a box of the canvas, and where it covers it.
 
-    ``image`` (H, W) or (H, W, 3). Returns (h, w) or (h, w, 3), continued by reflection outside
-    the picture, and the coverage (h, w), 0 or 255. Where the canvas is much smaller than the
-    picture, the picture is reduced by areas first, so that nothing aliases.
+    ``image`` (H, W) or (H, W, 3); ``opaque`` (H, W) is 0 where it shows nothing. Returns (h, w) or
+    (h, w, 3), continued by reflection outside the picture, and the coverage (h, w), 0 or 255.
+    Where the canvas is much smaller than the picture, the picture is reduced by areas first, so
+    that nothing aliases.
     """
     image, view = _reduced(image, view)
     x0, y0, x1, y1 = box
     size = x1 - x0, y1 - y0
-    solid = np.full(image.shape[:2], 255, np.uint8)
+    solid = _solid(image, opaque)
     flags, border = _FLAGS[warping], cv2.BORDER_REFLECT
     if view.kind == "planar":
         picture_from_box = np.linalg.inv(view.matrix) @ geometry.translation(x0, y0)
@@ -48,6 +51,17 @@ def warp(image: Image, view: View, box: Box, warping: Warping) -> tuple[Image, I
         warped = cv2.remap(image, xs, ys, flags, borderMode=border)
         cover = cv2.remap(solid, xs, ys, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
     return np.asarray(warped, np.uint8), np.asarray(cover, np.uint8)
+
+
+def _solid(image: Image, opaque: Image | None) -> Image:
+    if opaque is None:
+        return np.full(image.shape[:2], 255, np.uint8)
+    size = image.shape[1], image.shape[0]
+    if opaque.shape != image.shape[:2]:
+        opaque = np.asarray(cv2.resize(opaque, size, interpolation=cv2.INTER_AREA), np.uint8)
+        opaque = np.asarray(opaque >= 254, np.uint8) * np.uint8(255)
+    # A pixel less all round: interpolation reaches over the edge.
+    return np.asarray(cv2.erode(opaque, np.ones((3, 3), np.uint8)), np.uint8)
 
 
 def _reduced(image: Image, view: View) -> tuple[Image, View]:

@@ -148,6 +148,20 @@ def read_picture(path: str | Path) -> Image:
     return _composited(_eight_bit(decoded))
 
 
+def read_coverage(path: str | Path) -> Image | None:
+    """Opacity (H, W) of a picture that `read_picture` can read; None if it is opaque all over."""
+    with Path(path).open("rb") as file:
+        start = file.read(32)
+    is_opaque_png = start[1:4] == b"PNG" and start[25] not in (4, 6)
+    if is_opaque_png or start[:2] in (b"\xff\xd8", b"BM"):
+        return None
+    decoded = _decode(np.fromfile(path, np.uint8))
+    if decoded is None or decoded.ndim == 2 or decoded.shape[2] not in (2, 4):
+        return None
+    opacity = _eight_bit(np.ascontiguousarray(decoded[:, :, -1]))
+    return None if np.min(opacity) == 255 else opacity
+
+
 def _decode(data: npt.NDArray[np.uint8]) -> npt.NDArray[Any] | None:
     with _quiet_opencv():
         try:

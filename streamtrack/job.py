@@ -101,7 +101,8 @@ def run_track(job: TrackJob, progress: Progress, should_stop: Callable[[], bool]
                 progress.advance(step)
                 if is_over():
                     ended = f"interrupted after frame {step.frame.index}"
-                    error = StreamtrackError(f"{ended}: everything up to there is written")
+                    if not source.info.is_live:  # which ends in no other way
+                        error = StreamtrackError(f"{ended}: everything up to there is written")
                     break
         except StreamtrackError as raised:
             error, ended = raised, str(raised)
@@ -110,7 +111,7 @@ def run_track(job: TrackJob, progress: Progress, should_stop: Callable[[], bool]
         summary = builder.build(
             source.skipped,
             source.corrupt_packets,
-            ended or _natural_end(job, source, builder.frames),
+            ended or _natural_end(job, source, builder.frames, should_stop()),
             None if live is None else live.status(),
         )
         failure = watchers.finish(summary)
@@ -138,9 +139,11 @@ def _check_outputs(job: TrackJob) -> None:
         taken[path.resolve()] = f"the {name} output"
 
 
-def _natural_end(job: TrackJob, source: FrameSource, frames: int) -> str:
+def _natural_end(job: TrackJob, source: FrameSource, frames: int, was_stopped: bool) -> str:
     if frames == job.frames:
         return f"{frames} frames, as asked"
+    if was_stopped:
+        return "stopped, as asked"  # while waiting for a picture of a live source
     return f"the source {source.shortfall}" if source.shortfall else "end of source"
 
 

@@ -19,7 +19,7 @@ from streamtrack.sources.base import FrameSource
 from streamtrack.targets import Target, check_quad_in_picture
 from streamtrack.template import make_template
 from streamtrack.tracker import DetectTracker, HybridTracker, TargetTracker
-from streamtrack.types import Frame, Step, Track
+from streamtrack.types import CameraPose, Frame, Size, Step, Track
 
 _MAX_GAP_S = 1.0
 
@@ -49,6 +49,7 @@ def track(
     camera = camera or make_camera(settings, is_live=source.info.is_live)
     stop = None if frames is None else start + max(0, (frames - 1) * step + 1)
     is_first = True
+    world_size_wh = (0, 0)
     last: Frame | None = None
     for frame in islice(source, start, stop, step):
         began = time.perf_counter()
@@ -56,14 +57,14 @@ def track(
         view = FrameView(frame, extractors[work.index], work)
         if is_first:
             trackers = [make_tracker(target, view, extractors[0], settings) for target in targets]
-            is_first = False
+            is_first, world_size_wh = False, view.size_wh
         if last is not None and _is_elsewhere(last, frame):
             for tracker in trackers:
                 tracker.forget_place()
         last = frame
         tracks, track_ms = _follow_all(trackers, view)
         camera_began = time.perf_counter()
-        pose = camera.update(view, tracks)
+        pose = _camera_pose(camera, view, tracks, world_size_wh)
         ended = time.perf_counter()
         stage_ms = {**track_ms, "total": (ended - began) * 1e3}
         if view.detected is not None:
@@ -74,6 +75,15 @@ def track(
         yield Step(frame, tracks, pose, view.detected, stage_ms, work.index)
     if is_first and start > 0 and frames != 0:
         raise UsageError(f"the source has no frame {start}: it ended before")
+
+
+def _camera_pose(
+    camera: CameraEstimator, view: FrameView, tracks: Sequence[Track], world_size_wh: Size
+) -> CameraPose:
+    """The camera's pose, unknown in pictures of another size than the first: another camera."""
+    if view.size_wh != world_size_wh:
+        return CameraPose(None, reason="the picture's size changed")
+    return camera.update(view, tracks)
 
 
 def _is_elsewhere(last: Frame, frame: Frame) -> bool:

@@ -39,9 +39,11 @@ def merged_settings(path: Path | None, flags: dict[str, Any]) -> Settings:
 
 def default_recording(source: str, *, is_series: bool) -> Path:
     """A free name with the time of start; a series has one name, so that its limits hold."""
+    from streamtrack.sources.addresses import STDIN, redacted
     from streamtrack.types import SourceInfo
 
-    stem = Path(SourceInfo(source, (0, 0), None, None).name).stem or "source"
+    address = "stdin" if source == STDIN else redacted(source)
+    stem = Path(SourceInfo(address, (0, 0), None, None).name).stem or "source"
     safe = "".join(c if c.isalnum() or c in "-_." else "-" for c in stem)
     if is_series:
         return Path("recordings") / f"{safe}.rrd"

@@ -148,6 +148,9 @@ def track(
     ):
         outcome = run_track(job, progress, stop)
     if not quiet:
-        print_summary(console, outcome.summary.rows(), job.outputs.record)
+        shown = job.outputs.record
+        if shown is not None and chosen.recording.rotate is not None:
+            shown = max(shown.parent.glob(f"{shown.stem}-[0-9]*.rrd"), default=shown)
+        print_summary(console, outcome.summary.rows(), shown)
     if outcome.error is not None:
         raise outcome.error

@@ -43,13 +43,14 @@ class Limit:
 
 
 def parse_limit(text: str, option: str) -> Limit:
-    """A limit from words such as ``100MB``, ``10min``, ``2GB,7d``; ``option`` is for the message.
+    """A limit from words such as ``100MB``, ``10min``, ``2GB|7d``; ``option`` is for the message.
 
-    Sizes in KB, MB, GB, TB (powers of ten) or KiB ... TiB, ages in s, min, h, d. Raises UsageError.
+    Sizes in KB, MB, GB, TB (powers of ten) or KiB ... TiB, ages in s, min, h, d; between the two
+    stands ``|`` or a comma, which shells leave alone. Raises UsageError.
     """
     size_bytes: int | None = None
     age_s: float | None = None
-    for part in text.split(","):
+    for part in re.split(r"[|,]", text):
         match = _AMOUNT.fullmatch(part)
         unit = match[2].upper() if match else ""
         if match and unit in _BYTES and size_bytes is None:
@@ -59,7 +60,7 @@ def parse_limit(text: str, option: str) -> Limit:
         else:
             raise UsageError(
                 f"{option} '{text}': give a size (100MB, 2GB), an age (10min, 12h, 7d), "
-                "or both with a comma between"
+                "or both: 100MB,10min"
             )
     if size_bytes == 0 or age_s == 0.0:
         raise UsageError(f"{option} '{text}': give more than nothing")

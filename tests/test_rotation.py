@@ -44,6 +44,7 @@ from streamtrack.settings import build_settings
         ("7d", Limit(None, 7 * 86400.0)),
         ("2GB, 12h", Limit(2_000_000_000, 43200.0)),
         ("30s,5mb", Limit(5_000_000, 30.0)),
+        ("100MB|10min", Limit(100_000_000, 600.0)),
     ],
 )
 def test_limits(text, limit):
@@ -52,7 +53,7 @@ def test_limits(text, limit):
 
 @pytest.mark.parametrize(
     "text",
-    ["", "100", "MB", "-1MB", "10m", "5 parsec", "0MB", "0s", "1GB,2GB", "1h,", "1e3MB", "nanMB"],
+    ["", "100", "MB", "-1MB", "10m", "5 parsec", "0MB", "0s", "1GB,2GB", "1h,", "|1h", "1GB|2GB", "1e3MB", "nanMB"],
 )
 def test_nonsense_limits_are_refused(text):
     with pytest.raises(UsageError, match="keep"):

@@ -106,8 +106,8 @@ class TrackerProcess:
         return Sample(
             time.monotonic() - self.began_s,
             _rss_mb(pid),
-            len(os.listdir(f"/proc/{pid}/fd")),
-            len(os.listdir(f"/proc/{pid}/task")),
+            sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir()),
+            sum(1 for _ in Path(f"/proc/{pid}/task").iterdir()),
             len(children),
             sum(_rss_mb(child) for child in children),
         )

@@ -20,14 +20,12 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
-import cv2
-import numpy as np
 import rerun as rr
 import rerun_bindings
 
 from streamtrack import blueprint
 from streamtrack.errors import OutputError
-from streamtrack.geometry import inverted, scaling, transform_points
+from streamtrack.geometry import inverted, scaling
 from streamtrack.live_server import LiveAddress, LiveServer, ServerError, check_free
 from streamtrack.mosaic.types import MosaicView
 from streamtrack.recorded_file import Layout, new_stream
@@ -35,7 +33,8 @@ from streamtrack.recorded_steps import StepLog
 from streamtrack.recorded_video import Clock, jpeg_video
 from streamtrack.recording import RunLogHandler, timeline_of
 from streamtrack.settings import Settings
-from streamtrack.types import Image, Matrix, Size, SourceInfo, Step, Track
+from streamtrack.types import Image, Matrix, Size, SourceInfo, Step
+from streamtrack.working_size import mapped_features, mapped_track, resized
 
 _log = logging.getLogger("streamtrack.live")
 
@@ -246,10 +245,8 @@ class _Channel:
 
 
 def _resized(picture: Image, factor: float) -> Image:
-    if factor == 1.0:
-        return picture
-    size = max(1, round(picture.shape[1] * factor)), max(1, round(picture.shape[0] * factor))
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    height, width = picture.shape[:2]
+    return resized(picture, (max(1, round(width * factor)), max(1, round(height * factor))))
 
 
 def _scaled_step(step: Step, factor: float) -> Step:
@@ -258,28 +255,11 @@ def _scaled_step(step: Step, factor: float) -> Step:
         return step
     small_from_full = scaling(factor)
     features = step.features
-    if features is not None:
-        features = replace(features, points=transform_points(small_from_full, features.points))
     return replace(
         step,
         frame=replace(step.frame, image=_resized(step.frame.image, factor), packets=()),
-        tracks=tuple(_scaled_track(track, small_from_full) for track in step.tracks),
-        features=features,
-    )
-
-
-def _scaled_track(track: Track, small_from_full: Matrix) -> Track:
-    pose, evidence = track.frame_from_template, track.evidence
-    return replace(
-        track,
-        quad=None if track.quad is None else transform_points(small_from_full, track.quad),
-        frame_from_template=(
-            None if pose is None else small_from_full @ pose @ inverted(small_from_full)
+        tracks=tuple(
+            mapped_track(track, small_from_full, small_from_full) for track in step.tracks
         ),
-        evidence=replace(
-            evidence,
-            template_points=transform_points(small_from_full, evidence.template_points),
-            frame_points=transform_points(small_from_full, evidence.frame_points),
-            unmatched_points=transform_points(small_from_full, evidence.unmatched_points),
-        ),
+        features=None if features is None else mapped_features(features, small_from_full),
     )

@@ -19,9 +19,12 @@ from streamtrack.sources.base import FrameSource
 from streamtrack.targets import Target, check_quad_in_picture
 from streamtrack.template import make_template
 from streamtrack.tracker import DetectTracker, HybridTracker, TargetTracker
-from streamtrack.types import CameraPose, Frame, Size, Step, Track
+from streamtrack.types import CameraPose, Frame, Step, Track
+from streamtrack.working_size import WorkingSize
 
 _MAX_GAP_S = 1.0
+_POSE_AT_OTHER_SIZE = CameraPose(None, reason="the picture's size changed")
+"""Pictures of another size than the first are taken to be another camera's."""
 
 
 def track(
@@ -37,7 +40,8 @@ def track(
     """Follow targets through a source, one `Step` a frame.
 
     Quads are in pixels of the first frame that is used: frame ``start`` of the source, then every
-    ``step``-th, ``frames`` of them at most. ``camera`` is the settings' own unless it is given.
+    ``step``-th, ``frames`` of them at most. So are all results, also where ``settings.max_width``
+    has the work done on smaller pictures. ``camera`` is the settings' own unless it is given.
     When a live source was opened again (`Frame.epoch`), targets are looked for everywhere after a
     longer gap or in a picture of another size. Raises TargetError if a target cannot be tracked in
     that frame, SourceError when the source breaks, UsageError if it has no frame ``start``.
@@ -45,6 +49,7 @@ def track(
     settings = settings or Settings()
     extractors = _extractors(settings)
     budget = Budget(settings.tracker.budget_ms)
+    working_size = WorkingSize(settings.max_width)
     trackers: list[TargetTracker] = []
     camera = camera or make_camera(settings, is_live=source.info.is_live)
     stop = None if frames is None else start + max(0, (frames - 1) * step + 1)
@@ -54,17 +59,21 @@ def track(
     for frame in islice(source, start, stop, step):
         began = time.perf_counter()
         work = budget.level
-        view = FrameView(frame, extractors[work.index], work)
+        view = FrameView(working_size.small(frame), extractors[work.index], work)
         if is_first:
-            trackers = [make_tracker(target, view, extractors[0], settings) for target in targets]
-            is_first, world_size_wh = False, view.size_wh
+            trackers = [
+                make_tracker(working_size.target(target), view, extractors[0], settings)
+                for target in targets
+            ]
+            is_first, world_size_wh = False, frame.size_wh
         if last is not None and _is_elsewhere(last, frame):
             for tracker in trackers:
                 tracker.forget_place()
         last = frame
         tracks, track_ms = _follow_all(trackers, view)
         camera_began = time.perf_counter()
-        pose = _camera_pose(camera, view, tracks, world_size_wh)
+        is_same_size = frame.size_wh == world_size_wh
+        pose = camera.update(view, tracks) if is_same_size else _POSE_AT_OTHER_SIZE
         ended = time.perf_counter()
         stage_ms = {**track_ms, "total": (ended - began) * 1e3}
         if view.detected is not None:
@@ -72,18 +81,10 @@ def track(
         if settings.camera != "fixed":
             stage_ms["camera"] = (ended - camera_began) * 1e3
         budget.note(stage_ms["total"])
-        yield Step(frame, tracks, pose, view.detected, stage_ms, work.index)
+        step_seen = Step(view.frame, tracks, pose, view.detected, stage_ms, work.index)
+        yield working_size.full(frame, step_seen)
     if is_first and start > 0 and frames != 0:
         raise UsageError(f"the source has no frame {start}: it ended before")
-
-
-def _camera_pose(
-    camera: CameraEstimator, view: FrameView, tracks: Sequence[Track], world_size_wh: Size
-) -> CameraPose:
-    """The camera's pose, unknown in pictures of another size than the first: another camera."""
-    if view.size_wh != world_size_wh:
-        return CameraPose(None, reason="the picture's size changed")
-    return camera.update(view, tracks)
 
 
 def _is_elsewhere(last: Frame, frame: Frame) -> bool:

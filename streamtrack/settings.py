@@ -165,6 +165,9 @@ class Settings(_Section):
     registration: RegistrationSettings = RegistrationSettings()
     tracker: TrackerSettings = TrackerSettings()
     camera: CameraMode = "fixed"
+    max_width: int | None = Field(
+        default=None, ge=32, description="wider pictures are worked on smaller; None = as they are"
+    )
     recording: RecordingSettings = RecordingSettings()
     mosaic: MosaicSettings = MosaicSettings()
     live: LiveSettings = LiveSettings()

@@ -13,7 +13,7 @@ from streamtrack.errors import TargetError, UsageError
 from streamtrack.types import Image, Points, Size
 
 _FORMS = "x,y,w,h or x1,y1,x2,y2,x3,y3,x4,y4 or PICTURE or PICTURE@x,y,w,h"
-_MIN_SIDE_PX = 8.0
+MIN_SIDE_PX = 8.0
 _MAX_COORDINATE = 1e6
 
 
@@ -126,17 +126,21 @@ def _exists(path: Path) -> bool:
         return False
 
 
+def least_side_px(quad: Points) -> float:
+    """Length of the shortest side of a quad (4, 2)."""
+    return float(np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1).min())
+
+
 def check_quad_in_picture(
     name: str, quad: Points, size_wh: Size, where: str = "the first frame"
 ) -> None:
     """Raise TargetError unless the quad is convex, large enough and mostly inside a picture."""
     if not np.all(np.isfinite(quad)):
         raise TargetError(f"target '{name}' has coordinates that are not finite numbers")
-    sides = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1)
-    if sides.min() < _MIN_SIDE_PX:
+    if least_side_px(quad) < MIN_SIDE_PX:
         raise TargetError(
-            f"target '{name}' is only {sides.min():.0f} px wide or high: "
-            f"it needs at least {_MIN_SIDE_PX:.0f} px"
+            f"target '{name}' is only {least_side_px(quad):.0f} px wide or high: "
+            f"it needs at least {MIN_SIDE_PX:.0f} px"
         )
     if not geometry.is_convex(quad):
         raise TargetError(f"target '{name}' is no convex quad: give its corners in order around it")

@@ -20,10 +20,12 @@ from streamtrack.settings import Settings
 from streamtrack.sources.base import FrameSource
 from streamtrack.summary import Summary
 from streamtrack.types import Image, SourceInfo, Step
+from streamtrack.working_size import FullSizeGraph, full_from_small
 
 if TYPE_CHECKING:
     from streamtrack.live_server import LiveAddress
     from streamtrack.live_view import LiveView
+    from streamtrack.mosaic.stream import PoseGraph, StreamMosaic
     from streamtrack.recording import Recorder
     from streamtrack.sources.live import LiveSource
 
@@ -101,7 +103,11 @@ def open_watchers(
     displays = _open_displays(outputs, info, settings, views, stack, result)
     result.watchers.extend(display.log for display in displays)
     if outputs.mosaic is not None:
-        _add_mosaic(outputs.mosaic, settings, camera, displays, stack, result)
+        from streamtrack.mosaic.stream import StreamMosaic
+
+        graph = _graph_in_full_size(camera, info, settings)
+        mosaic = stack.enter_context(StreamMosaic(settings.mosaic, graph))
+        _add_mosaic(outputs.mosaic, mosaic, camera, displays, result)
     live = live_source(source)
     if live is not None:
         result.watchers.append(_live_watcher(live, displays))
@@ -144,19 +150,24 @@ def _closer(display: Recorder | LiveView) -> Finisher:
     return lambda summary: display.close(summary.to_markdown())
 
 
+def _graph_in_full_size(
+    camera: CameraEstimator, info: SourceInfo, settings: Settings
+) -> PoseGraph | None:
+    """The keyframes in the pixels of the frames as they come, whatever the work is done on."""
+    graph = camera.graph if isinstance(camera, MovingCamera) else None
+    if graph is None or settings.max_width is None:
+        return graph
+    return FullSizeGraph(graph, full_from_small(info.size_wh, settings.max_width))
+
+
 def _add_mosaic(
     path: Path,
-    settings: Settings,
+    mosaic: StreamMosaic,
     camera: CameraEstimator,
     displays: Sequence[Recorder | LiveView],
-    stack: ExitStack,
     result: Watchers,
 ) -> None:
     """Grow a mosaic with the run and write it at the end; targets are left out of it."""
-    from streamtrack.mosaic.stream import StreamMosaic
-
-    graph = camera.graph if isinstance(camera, MovingCamera) else None
-    mosaic = stack.enter_context(StreamMosaic(settings.mosaic, graph))
     last: list[tuple[int, float]] = []
 
     def watch(step: Step) -> None:

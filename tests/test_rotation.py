@@ -53,7 +53,22 @@ def test_limits(text, limit):
 
 @pytest.mark.parametrize(
     "text",
-    ["", "100", "MB", "-1MB", "10m", "5 parsec", "0MB", "0s", "1GB,2GB", "1h,", "|1h", "1GB|2GB", "1e3MB", "nanMB"],
+    [
+        "",
+        "100",
+        "MB",
+        "-1MB",
+        "10m",
+        "5 parsec",
+        "0MB",
+        "0s",
+        "1GB,2GB",
+        "1h,",
+        "|1h",
+        "1GB|2GB",
+        "1e3MB",
+        "nanMB",
+    ],
 )
 def test_nonsense_limits_are_refused(text):
     with pytest.raises(UsageError, match="keep"):

@@ -93,6 +93,13 @@ def track(
     keep: Annotated[
         str | None, typer.Option(help="Remove the oldest of them beyond 2GB, 7d, or both.")
     ] = None,
+    max_width: Annotated[
+        int | None,
+        typer.Option(
+            metavar="PX",
+            help="Work on wider pictures at this width; results stay in pixels of the source.",
+        ),
+    ] = None,
     max_fps: Annotated[
         float | None, typer.Option(help="Leave out pictures of a live source beyond this rate.")
     ] = None,
@@ -115,6 +122,7 @@ def track(
             "registration": {"model": model},
             "tracker": {"method": method, "budget_ms": budget},
             "camera": camera,
+            "max_width": max_width,
             "recording": {"video": record_video, "rotate": rotate, "keep": keep},
             "live": {"max_fps": max_fps, "retries": retries},
         },

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from streamtrack.settings import Settings, build_settings
     from streamtrack.sources import open_source
     from streamtrack.sources.base import FrameSource
-    from streamtrack.targets import Target, parse_targets
+    from streamtrack.targets import AutoTarget, Target, parse_targets
     from streamtrack.types import (
         CameraPose,
         Evidence,
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
+    "AutoTarget",
     "CameraPose",
     "Evidence",
     "Features",
@@ -81,7 +82,7 @@ _HOMES = {
     "streamtrack.settings": ("Settings", "build_settings"),
     "streamtrack.sources": ("open_source",),
     "streamtrack.sources.base": ("FrameSource",),
-    "streamtrack.targets": ("Target", "parse_targets"),
+    "streamtrack.targets": ("AutoTarget", "Target", "parse_targets"),
 }
 
 

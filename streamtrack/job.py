@@ -23,7 +23,7 @@ from streamtrack.settings import Settings
 from streamtrack.sources import open_source
 from streamtrack.sources.base import FrameSource
 from streamtrack.summary import Summary, SummaryBuilder
-from streamtrack.targets import Target
+from streamtrack.targets import TargetSpec, given_targets
 from streamtrack.types import SourceInfo, Step
 from streamtrack.watching import Outputs, live_source, open_watchers
 
@@ -33,7 +33,7 @@ class TrackJob:
     """All that one run needs to know."""
 
     source: str | Sequence[str]
-    targets: Sequence[Target]
+    targets: Sequence[TargetSpec]
     settings: Settings = field(default_factory=Settings)
     outputs: Outputs = field(default_factory=Outputs)
     start: int = 0
@@ -88,7 +88,7 @@ def run_track(job: TrackJob, progress: Progress, should_stop: Callable[[], bool]
         first = next(steps, None)
         if first is None:
             raise SourceError(f"{source.info.name}: no frame could be read")
-        views = {target.name: target.picture for target in job.targets}
+        views = {target.name: target.picture for target in given_targets(job.targets)}
         watchers = open_watchers(job.outputs, source, job.settings, views, camera, stack)
         progress.begin(source.info, _expected_frames(job, source.info))
         service.ready(f"tracking {source.info.name}")

@@ -9,6 +9,7 @@ from itertools import islice
 import numpy as np
 
 from streamtrack import geometry
+from streamtrack.auto import AutoTargets
 from streamtrack.budget import LEVELS, Budget
 from streamtrack.camera import CameraEstimator, make_camera
 from streamtrack.errors import TargetError, UsageError
@@ -16,7 +17,13 @@ from streamtrack.features import FeatureExtractor
 from streamtrack.frame_view import FrameView
 from streamtrack.settings import Settings
 from streamtrack.sources.base import FrameSource
-from streamtrack.targets import Target, check_quad_in_picture
+from streamtrack.targets import (
+    Target,
+    TargetSpec,
+    auto_target,
+    check_quad_in_picture,
+    given_targets,
+)
 from streamtrack.template import make_template
 from streamtrack.tracker import DetectTracker, HybridTracker, TargetTracker
 from streamtrack.types import CameraPose, Frame, Step, Track
@@ -29,7 +36,7 @@ _POSE_AT_OTHER_SIZE = CameraPose(None, reason="the picture's size changed")
 
 def track(
     source: FrameSource,
-    targets: Sequence[Target],
+    targets: Sequence[TargetSpec],
     settings: Settings | None = None,
     *,
     start: int = 0,
@@ -50,6 +57,8 @@ def track(
     extractors = _extractors(settings)
     budget = Budget(settings.tracker.budget_ms)
     working_size = WorkingSize(settings.max_width)
+    given = given_targets(targets)
+    auto = _make_auto(targets)
     trackers: list[TargetTracker] = []
     camera = camera or make_camera(settings, is_live=source.info.is_live)
     stop = None if frames is None else start + max(0, (frames - 1) * step + 1)
@@ -63,28 +72,46 @@ def track(
         if is_first:
             trackers = [
                 make_tracker(working_size.target(target), view, extractors[0], settings)
-                for target in targets
+                for target in given
             ]
             is_first, world_size_wh = False, frame.size_wh
         if last is not None and _is_elsewhere(last, frame):
             for tracker in trackers:
                 tracker.forget_place()
+            auto = _make_auto(targets, auto)
         last = frame
         tracks, track_ms = _follow_all(trackers, view)
         camera_began = time.perf_counter()
         is_same_size = frame.size_wh == world_size_wh
-        pose = camera.update(view, tracks) if is_same_size else _POSE_AT_OTHER_SIZE
+        moving = tracks if auto is None else (*tracks, *auto.expected())
+        pose = camera.update(view, moving) if is_same_size else _POSE_AT_OTHER_SIZE
+        camera_ended = time.perf_counter()
+        if auto is not None:
+            tracks = (*tracks, *auto.update(view, pose, tracks))
         ended = time.perf_counter()
         stage_ms = {**track_ms, "total": (ended - began) * 1e3}
+        if auto is not None:
+            stage_ms["auto"] = (ended - camera_ended) * 1e3
         if view.detected is not None:
             stage_ms["detect"] = view.detect_ms
         if settings.camera != "fixed":
-            stage_ms["camera"] = (ended - camera_began) * 1e3
+            stage_ms["camera"] = (camera_ended - camera_began) * 1e3
         budget.note(stage_ms["total"])
         step_seen = Step(view.frame, tracks, pose, view.detected, stage_ms, work.index)
         yield working_size.full(frame, step_seen)
     if is_first and start > 0 and frames != 0:
         raise UsageError(f"the source has no frame {start}: it ended before")
+
+
+def _make_auto(
+    targets: Sequence[TargetSpec], before: AutoTargets | None = None
+) -> AutoTargets | None:
+    """What finds targets by itself, if that is asked for; its names go on after those before."""
+    wish = auto_target(targets)
+    if wish is None:
+        return None
+    taken = [target.name for target in given_targets(targets)]
+    return AutoTargets(wish.name, taken, 0 if before is None else before.count)
 
 
 def _is_elsewhere(last: Frame, frame: Frame) -> bool:

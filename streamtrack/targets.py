@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -12,7 +13,8 @@ from streamtrack import geometry
 from streamtrack.errors import TargetError, UsageError
 from streamtrack.types import Image, Points, Size
 
-_FORMS = "x,y,w,h or x1,y1,x2,y2,x3,y3,x4,y4 or PICTURE or PICTURE@x,y,w,h"
+_FORMS = "x,y,w,h or x1,y1,x2,y2,x3,y3,x4,y4 or PICTURE or PICTURE@x,y,w,h or auto"
+_AUTO = "auto"
 MIN_SIDE_PX = 8.0
 _MAX_COORDINATE = 1e6
 
@@ -35,20 +37,32 @@ class Target:
             raise ValueError("a target has a quad, a picture or both")
 
 
-def parse_targets(texts: Sequence[str]) -> list[Target]:
-    """Targets from ``[NAME=]x,y,w,h``, ``[NAME=]x1,...,y4`` or ``[NAME=]PICTURE[@region]``.
+@dataclass(frozen=True, slots=True)
+class AutoTarget:
+    """Whatever moves against the background; its names are ``<name>-1``, ``<name>-2`` ..."""
+
+    name: str = _AUTO
+
+
+TargetSpec: TypeAlias = Target | AutoTarget
+
+
+def parse_targets(texts: Sequence[str]) -> list[TargetSpec]:
+    """Targets from ``[NAME=]`` and ``x,y,w,h``, ``x1,...,y4``, ``PICTURE[@region]`` or ``auto``.
 
     The region of a picture is given as a box or a quad too, in the picture's pixels.
 
     Without a name, the only target is called ``target``, several ``target1``, ``target2`` ...
     Raises UsageError for what is no target, TargetError for a picture that cannot be read.
     """
-    targets = []
+    targets: list[TargetSpec] = []
     for number, text in enumerate(texts, start=1):
         if not text.isprintable():
             raise UsageError(f"target {text!r}: leave out line breaks and control characters")
         default = "target" if len(texts) == 1 else f"target{number}"
         targets.append(_parse_target(text, default))
+    if sum(isinstance(target, AutoTarget) for target in targets) > 1:
+        raise UsageError("auto is given twice: once finds all that moves")
     names = [target.name for target in targets]
     for name in names:
         if names.count(name) > 1:
@@ -56,13 +70,27 @@ def parse_targets(texts: Sequence[str]) -> list[Target]:
     return targets
 
 
-def _parse_target(text: str, default_name: str) -> Target:
+def given_targets(targets: Sequence[TargetSpec]) -> list[Target]:
+    """Those that the user has shown."""
+    return [target for target in targets if isinstance(target, Target)]
+
+
+def auto_target(targets: Sequence[TargetSpec]) -> AutoTarget | None:
+    """The wish for automatic targets, if it is among them."""
+    return next((target for target in targets if isinstance(target, AutoTarget)), None)
+
+
+def _parse_target(text: str, default_name: str) -> TargetSpec:
+    if text.strip() == _AUTO:
+        return AutoTarget()
     name, separator, rest = text.partition("=")
     if not separator or not name.strip() or _is_picture(text):
         name, rest = default_name, text
     name, rest = name.strip(), rest.strip()
     if not rest:
         raise UsageError(f"target '{text}' is empty: give {_FORMS}")
+    if rest == _AUTO:
+        return AutoTarget(name)
     numbers = _parse_numbers(rest)
     if numbers is not None:
         return Target(name, quad=_quad_from_numbers(numbers, rest))

@@ -35,7 +35,7 @@ def track(
         list[str],
         typer.Option(
             help="[NAME=]x,y,w,h or [NAME=]x1,y1,...,x4,y4 in pixels of the first frame, or "
-            "[NAME=]PICTURE[@region of it] to search for. May repeat.",
+            "[NAME=]PICTURE[@region of it] to search for, or auto: all that moves. May repeat.",
         ),
     ],
     method: Annotated[

@@ -1,0 +1,246 @@
+"""From pixels that stand out to things: connected, trimmed of their shadows, with their motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from streamtrack import geometry
+from streamtrack.auto.background import Outstanding
+from streamtrack.types import Image, Mask
+
+Doubles: TypeAlias = npt.NDArray[np.float64]
+
+_LEAST_PIXELS = 14  # of the grid
+_LEAST_CLEAR = 6
+_ALL_KNOWN_SHARE = 0.98
+_CLOSING_PX = 5
+_SHADE_CLOSING_PX = 9
+_MOST_BLOBS = 80
+_FASTEST_PX = 14.0  # grid pixels a frame that flow still measures
+_BINS = 4
+_FRAGMENT_GAP_PX = 5.0  # grid pixels
+_FRAGMENT_SHARE = 0.3  # of the area of the thing it belongs to
+_ALIKE_PX = 0.8  # grid pixels a frame, between motions of parts of one thing
+_SPLIT_PIXELS = 60
+_SPLIT_SHARE = 0.22
+_SPLIT_PX = 1.0  # grid pixels a frame between the motions of two things that touch
+_TIGHT = 0.45  # spread within the parts against the distance between them
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Blob:
+    """One thing that stands out.
+
+    box       (4,) x0, y0, x1, y1, full-resolution pixels of the frame
+    motion    (2,) full-resolution pixels since the frame before, against the background; NaN if
+              that is not known
+    colors    (64,) histogram of its colours, sums to 1
+    """
+
+    box: Doubles
+    motion: Doubles
+    colors: Doubles
+
+    @property
+    def center(self) -> Doubles:
+        return 0.5 * (self.box[:2] + self.box[2:])
+
+    @property
+    def size(self) -> Doubles:
+        return self.box[2:] - self.box[:2]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What moves in one frame: the blobs, the pixels (h, w) they consist of, and the motion there.
+
+    ``motion`` (h, w, 2) are grid pixels since the frame before, None if that is not known.
+    """
+
+    blobs: tuple[Blob, ...]
+    solid: Mask
+    motion: npt.NDArray[np.float32] | None
+    grid_from_frame: Doubles
+
+
+class MotionField:
+    """Motion against the background, by DIS flow (Kroeger et al. 2016) in the background's grid."""
+
+    def __init__(self) -> None:
+        self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+
+    def measure(self, outstanding: Outstanding) -> npt.NDArray[np.float32] | None:
+        """(h, w, 2) grid pixels since the frame before; None without anything to measure."""
+        before = outstanding.grey_before
+        if before is None or min(before.shape) < 24:
+            return None
+        if outstanding.known.mean() > _ALL_KNOWN_SHARE and not outstanding.clear.any():
+            return None
+        backward = np.zeros((*before.shape, 2), np.float32)
+        self._flow.calc(outstanding.grey, before, backward)
+        return -backward
+
+
+def find_blobs(
+    outstanding: Outstanding, hidden: Mask, motion: npt.NDArray[np.float32] | None
+) -> Scene:
+    """The things that stand out outside ``hidden`` (h, w), the largest first."""
+    clear = outstanding.clear & ~hidden
+    solid = np.zeros(clear.shape, np.bool_)
+    blobs: list[Blob] = []
+    if clear.any():
+        joined = _joined(clear, outstanding.faint & ~hidden, outstanding.shade)
+        count, parts, stats, _ = cv2.connectedComponentsWithStats(joined, connectivity=4)
+        clear_counts = np.bincount(parts[clear], minlength=count)
+        areas = stats[:, cv2.CC_STAT_AREA]
+        is_kept = (areas >= _LEAST_PIXELS) & (clear_counts >= _LEAST_CLEAR)
+        is_kept[0] = False
+        kept = np.flatnonzero(is_kept)
+        for part in kept[np.argsort(-areas[kept])][:_MOST_BLOBS]:
+            x, y, width, height = stats[part, :4]
+            window = slice(y, y + height), slice(x, x + width)
+            inside = parts[window] == part
+            for piece in [inside] if motion is None else _split(inside, motion[window]):
+                solid[window] |= piece
+                blobs.append(_blob(piece, window, outstanding, motion))
+    blobs = _with_fragments(blobs, frame_px(outstanding))
+    return Scene(tuple(blobs), solid, motion, outstanding.grid_from_frame)
+
+
+def _with_fragments(blobs: list[Blob], grid_px: float) -> list[Blob]:
+    """The blobs, the small ones made part of a larger one beside them that moves alike."""
+    kept: list[Blob] = []
+    for blob in sorted(blobs, key=lambda blob: -float(np.prod(blob.size))):
+        for row, larger in enumerate(kept):
+            if _is_fragment(blob, larger, grid_px):
+                kept[row] = united_blob([larger, blob])
+                break
+        else:
+            kept.append(blob)
+    return kept
+
+
+def _is_fragment(blob: Blob, larger: Blob, grid_px: float) -> bool:
+    gap = np.maximum(blob.box[:2] - larger.box[2:], larger.box[:2] - blob.box[2:]).max()
+    if gap > _FRAGMENT_GAP_PX * grid_px:
+        return False
+    if not float(np.hypot(*(blob.motion - larger.motion))) < _ALIKE_PX * grid_px:
+        return False
+    sides = np.minimum(blob.box[2:], larger.box[2:]) - np.maximum(blob.box[:2], larger.box[:2])
+    area = float(np.prod(blob.size))
+    is_inside = bool((sides > 0).all()) and float(np.prod(sides)) > 0.5 * area
+    return is_inside or area < _FRAGMENT_SHARE * float(np.prod(larger.size))
+
+
+def united_blob(parts: Sequence[Blob]) -> Blob:
+    """Parts of one thing as one blob, with the motion of the largest."""
+    areas = np.array([float(np.prod(part.size)) for part in parts])
+    shares = areas / areas.sum()
+    largest = parts[int(np.argmax(areas))]
+    boxes = np.stack([part.box for part in parts])
+    box = np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
+    return replace(largest, box=box, colors=shares @ np.stack([part.colors for part in parts]))
+
+
+def frame_px(outstanding: Outstanding) -> float:
+    """Pixels of the frame a pixel of the grid."""
+    height, width = outstanding.clear.shape
+    frame_from_grid = geometry.inverted(outstanding.grid_from_frame)
+    return geometry.local_scale(frame_from_grid, np.array([width / 2, height / 2]))
+
+
+def _joined(clear: Mask, faint: Mask, shade: Mask) -> Image:
+    """What differs (h, w), without its shadows and with its gaps closed."""
+    differing = ((faint | clear) & ~shade).astype(np.uint8)
+    solid = np.asarray(cv2.medianBlur(differing, 3), np.uint8)
+    closed = cv2.morphologyEx(solid, cv2.MORPH_CLOSE, _ellipse(_CLOSING_PX))
+    within = cv2.morphologyEx(solid, cv2.MORPH_CLOSE, _ellipse(_SHADE_CLOSING_PX))
+    return np.asarray(cv2.bitwise_or(closed, cv2.bitwise_and(within, shade.astype(np.uint8))))
+
+
+def _ellipse(side_px: int) -> Image:
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side_px, side_px))
+    return np.asarray(kernel, np.uint8)
+
+
+def _split(inside: Mask, motion: npt.NDArray[np.float32]) -> list[Mask]:
+    """Two parts if the pixels move in two ways that keep apart, in the picture too."""
+    rows, columns = np.nonzero(inside)
+    if len(rows) < _SPLIT_PIXELS:
+        return [inside]
+    moved = motion[rows, columns].astype(np.float64)
+    middle = moved.mean(axis=0)
+    spread = moved - middle
+    covariance = spread.T @ spread / len(moved)
+    values, axes = np.linalg.eigh(covariance)
+    if np.sqrt(values[1]) < 0.5 * _SPLIT_PX:
+        return [inside]
+    along = spread @ axes[:, 1]
+    cut, low, high = 0.0, along, along
+    for _ in range(4):  # two means along the main axis of the motions
+        low, high = along[along < cut], along[along >= cut]
+        if not len(low) or not len(high):
+            return [inside]
+        cut = 0.5 * (float(low.mean()) + float(high.mean()))
+    apart = float(high.mean() - low.mean())
+    within = float(np.sqrt((low.var() * len(low) + high.var() * len(high)) / len(along)))
+    if apart < _SPLIT_PX or within > _TIGHT * apart:
+        return [inside]
+    is_high = np.zeros_like(inside)
+    is_high[rows, columns] = along >= cut
+    is_high = (cv2.medianBlur(is_high.astype(np.uint8), 5) > 0) & inside
+    parts = [_largest(is_high), _largest(inside & ~is_high)]
+    if min(np.count_nonzero(part) for part in parts) < _SPLIT_SHARE * len(rows):
+        return [inside]
+    return parts
+
+
+def _largest(mask: Mask) -> Mask:
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    if count <= 1:
+        return mask
+    largest: Mask = labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    return largest
+
+
+def _blob(
+    piece: Mask,
+    window: tuple[slice, slice],
+    outstanding: Outstanding,
+    motion: npt.NDArray[np.float32] | None,
+) -> Blob:
+    rows, columns = np.flatnonzero(piece.any(axis=1)), np.flatnonzero(piece.any(axis=0))
+    y, x = window[0].start, window[1].start
+    low = np.array([x + columns[0] - 0.5, y + rows[0] - 0.5])
+    high = np.array([x + columns[-1] + 0.5, y + rows[-1] + 0.5])
+    box, scale = frame_box(low, high, outstanding.grid_from_frame)
+    moved = np.full(2, np.nan)
+    if motion is not None:
+        middle = np.median(motion[window][piece], axis=0).astype(np.float64)
+        if np.abs(middle).max() <= _FASTEST_PX:
+            moved = middle * scale
+    return Blob(box, moved, color_histogram(outstanding.image[window], piece))
+
+
+def frame_box(low: Doubles, high: Doubles, grid_from_frame: Doubles) -> tuple[Doubles, float]:
+    """An upright box of the grid as one of the frame: x0, y0, x1, y1, and frame px a grid px."""
+    frame_from_grid = geometry.inverted(grid_from_frame)
+    center = 0.5 * (low + high)
+    scale = geometry.local_scale(frame_from_grid, center)
+    middle = geometry.transform_points(frame_from_grid, center)[0].astype(np.float64)
+    half = 0.5 * scale * (high - low)
+    return np.concatenate([middle - half, middle + half]), scale
+
+
+def color_histogram(image: Image, mask: Mask) -> Doubles:
+    """Shares (64,) of the colours of the pixels of ``image`` (h, w, 3) under a mask."""
+    bins = (image[mask] >> 6).astype(np.intp)
+    index = bins[:, 0] * _BINS * _BINS + bins[:, 1] * _BINS + bins[:, 2]
+    counts = np.bincount(index, minlength=_BINS**3).astype(np.float64)
+    return np.asarray(counts / max(1.0, counts.sum()), np.float64)

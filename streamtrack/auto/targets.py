@@ -1,0 +1,430 @@
+"""Automatic targets of one stream: found by their motion, confirmed, named, followed, ended.
+
+Each frame is compared with the background (`background`); what stands out becomes blobs
+(`blobs`), blobs are paired with the things that are known (`association`), and what stays unpaired
+becomes a target once it has been seen to move for some frames. One that is hidden is lost, without
+a place, and is taken up again under its name if it reappears in time; one that leaves just ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from streamtrack import geometry
+from streamtrack.auto.association import associate
+from streamtrack.auto.background import BackgroundModel, Outstanding
+from streamtrack.auto.blobs import Blob, MotionField, Scene, find_blobs, frame_px
+from streamtrack.auto.followed import Followed, Life, overlap, touched_edges
+from streamtrack.frame_view import FrameView
+from streamtrack.types import (
+    CameraPose,
+    Image,
+    Mask,
+    Matrix,
+    Model,
+    Size,
+    Track,
+    TrackState,
+)
+
+Doubles: TypeAlias = npt.NDArray[np.float64]
+
+_WIDTH_PX = 320
+_LEAST_WIDTH_PX = 24
+_CONFIRMED_S = 0.12
+_LEAST_HITS = 4
+_MOVED_PX = 2.5  # grid pixels
+_MOVED_SHARE = 0.06  # of its size
+_STRAIGHT_SHARE = 0.5  # of its path
+_FLOWED_SHARE = 0.3  # of its way, that its pixels must have moved along
+_MAX_MISSES = 2  # frames, of what is not confirmed yet
+_COAST_S = 2.0
+_SLOWER_AFTER_S = 0.5  # lost, until which it is thought to go on as fast
+_MOST_TARGETS = 60
+_BROKEN_SHARE = 0.5  # of the picture that changes at once
+_BROKEN_FRAMES = 5  # in a row, after which the scene is another one
+_DUPLICATE_OVERLAP = 0.75
+_CARRYING_SHARE = 0.3  # of a thing's place that must stand out for it to be carried
+_REACH_PX = 4.0  # grid pixels, beyond which nothing is found again
+_ELDER_HITS = 10  # sightings of its own that make it a thing of its own
+_ALIKE_PX = 0.8  # grid pixels a frame, between motions of parts of one thing
+_REST_PX = 0.4  # grid pixels a frame, below which a thing stands
+_REST_FRAMES = 8
+_USUAL_STEP_S = 0.04
+_MAX_STEP_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Moment:
+    """Seconds since the frame before, frame pixels a grid pixel, and the frame's size."""
+
+    step_s: float
+    grid_px: float
+    size_wh: Size
+
+
+class AutoTargets:
+    """Finds and follows what moves; names are ``<prefix>-1``, ``<prefix>-2`` ..., none twice.
+
+    ``taken`` names are left out, and the numbers go on after ``count``.
+    """
+
+    def __init__(self, prefix: str = "auto", taken: Collection[str] = (), count: int = 0) -> None:
+        self._prefix = prefix
+        self._taken = frozenset(taken)
+        self.count = count
+        self._field = MotionField()
+        self._background: BackgroundModel | None = None
+        self._things: list[Followed] = []
+        self._world_from_before: Matrix | None = None
+        self._time_s = 0.0
+        self._step_s = _USUAL_STEP_S
+        self._broken = 0
+
+    def expected(self) -> list[Track]:
+        """Where the targets will be in the next frame if the camera stands: for its estimate."""
+        return [
+            self._track(thing, thing.box + np.tile(thing.velocity * self._step_s, 2))
+            for thing in self._things
+            if thing.life in (Life.SEEN, Life.CARRIED)
+        ]
+
+    def update(self, view: FrameView, pose: CameraPose, given: Sequence[Track]) -> list[Track]:
+        """The targets in this frame; what belongs to the ``given`` ones is left to them."""
+        step_s = self._clocked(view.frame.time_s)
+        world_from_frame = pose.world_from_frame
+        if world_from_frame is None or not _is_invertible(world_from_frame):
+            return self._blind("the camera's pose is not known")
+        small, small_from_frame = _reduced(view)
+        if min(small.shape[:2]) < _LEAST_WIDTH_PX:
+            return self._blind("the picture is too small")
+        size_wh = (small.shape[1], small.shape[0])
+        world_from_small = geometry.normalized(
+            world_from_frame @ geometry.inverted(small_from_frame)
+        )
+        if self._background is None or self._background.size_wh != size_wh:
+            self._background = BackgroundModel(size_wh, world_from_small)
+        seen = self._background.compare(small, world_from_small, small_from_frame)
+        self._predict(world_from_frame, view.frame.time_s)
+        if seen.share > _BROKEN_SHARE:
+            return self._broken_off(world_from_small, small, small_from_frame)
+        self._broken = 0
+        scene = find_blobs(seen, _hidden(seen, given), self._field.measure(seen))
+        moment = _Moment(step_s, frame_px(seen), view.size_wh)
+        self._associate(scene, moment)
+        self._confirm(moment.grid_px)
+        self._drop_duplicates()
+        self._background.learn(seen, _moving(scene), self._protected(seen))
+        self._end_left_places(self._background, scene, moment)
+        return self._tracks()
+
+    def _clocked(self, time_s: float) -> float:
+        """Seconds since the frame before; the usual step where clocks jump."""
+        step_s = time_s - self._time_s
+        self._time_s = time_s
+        if not 0 < step_s <= _MAX_STEP_S:
+            return self._step_s
+        self._step_s = step_s
+        return step_s
+
+    def _predict(self, world_from_frame: Matrix, time_s: float) -> None:
+        if self._world_from_before is not None:
+            frame_from_before = geometry.normalized(
+                geometry.inverted(world_from_frame) @ self._world_from_before
+            )
+            for thing in self._things:
+                if thing.life is Life.LOST and thing.lost_s > _SLOWER_AFTER_S:
+                    thing.velocity = thing.velocity * 0.9
+                thing.predict(frame_from_before, time_s)
+        self._world_from_before = world_from_frame
+
+    def _associate(self, scene: Scene, moment: _Moment) -> None:
+        reach_px = _REACH_PX * moment.grid_px
+        found = associate(self._things, scene.blobs, reach_px)
+        pairs = list(found.pairs)
+        carried: list[Followed] = []
+        for things, blob in found.shared:
+            own = _own_things(things, moment)
+            for fragment in things:
+                if not any(fragment is thing for thing in own):
+                    fragment.life = Life.OVER
+            if len(own) == 1:
+                pairs.append((own[0], blob))
+                continue
+            for thing in own:
+                _carry(thing, scene, moment)
+                thing.resume(Life.CARRIED)
+            _hold_to_edges(own, blob)
+            carried += own
+        for thing, blob in pairs:
+            thing.take(blob, moment.step_s, moment.size_wh)
+            thing.resume(Life.SEEN)
+        met = {id(thing) for thing in [*(thing for thing, _ in pairs), *carried]}
+        for thing in self._things:
+            if id(thing) not in met:
+                self._miss(thing, scene, moment)
+        self._things = [thing for thing in self._things if not _is_over(thing, moment.size_wh)]
+        self._things += [
+            Followed.begun(blob, self._time_s, moment.step_s)
+            for blob in found.free
+            if not self._is_claimed(blob)
+        ]
+
+    def _miss(self, thing: Followed, scene: Scene, moment: _Moment) -> None:
+        """It was found nowhere: its pixels may still show it, else it is lost."""
+        thing.misses += 1
+        if thing.life in (Life.NEW, Life.OVER):
+            return
+        if thing.life is not Life.LOST and _carry(thing, scene, moment) >= _CARRYING_SHARE:
+            thing.life = Life.CARRIED
+            return
+        thing.life = Life.LOST
+        thing.lost_s += moment.step_s
+        thing.reason = "hidden, or no longer told from the background"
+
+    def _end_left_places(self, background: BackgroundModel, scene: Scene, moment: _Moment) -> None:
+        """End what only marks the place that something left, and heal the background there."""
+        for thing in self._things:
+            if thing.life not in (Life.SEEN, Life.CARRIED):
+                continue
+            thing.note_rest(_REST_PX * moment.grid_px, moment.step_s)
+            if thing.still >= _REST_FRAMES and thing.still % _REST_FRAMES == 0:
+                place = np.zeros(scene.solid.shape, np.uint8)
+                _fill(place, thing.quad, scene.grid_from_frame, 1)
+                there = (place > 0) & scene.solid
+                if background.has_left(there):
+                    background.heal(there)
+                    thing.life = Life.OVER
+        self._things = [thing for thing in self._things if thing.life is not Life.OVER]
+
+    def _is_claimed(self, blob: Blob) -> bool:
+        return any(
+            overlap(blob.box, thing.box)[1] > 0.6
+            for thing in self._things
+            if thing.life in (Life.SEEN, Life.CARRIED)
+        )
+
+    def _confirm(self, frame_px: float) -> None:
+        """Name the things that have been seen often enough and have moved."""
+        least = max(_LEAST_HITS, round(_CONFIRMED_S / self._step_s))
+        named = sum(thing.life is not Life.NEW for thing in self._things)
+        for thing in self._things:
+            if thing.life is not Life.NEW or thing.misses or thing.hits < least:
+                continue
+            if named >= _MOST_TARGETS or not _has_moved(thing, frame_px):
+                continue
+            thing.life, thing.name, named = Life.SEEN, self._next_name(), named + 1
+            thing.home = thing.box.copy()
+
+    def _next_name(self) -> str:
+        while True:
+            self.count += 1
+            name = f"{self._prefix}-{self.count}"
+            if name not in self._taken:
+                return name
+
+    def _drop_duplicates(self) -> None:
+        """Of two things at one place the one that was seen for longer is right."""
+        named = [thing for thing in self._things if thing.life in (Life.SEEN, Life.CARRIED)]
+        named.sort(key=lambda thing: -thing.hits)
+        for index, thing in enumerate(named):
+            for younger in named[index + 1 :]:
+                if overlap(thing.box, younger.box)[0] > _DUPLICATE_OVERLAP:
+                    younger.life = Life.OVER
+        self._things = [thing for thing in self._things if thing.life is not Life.OVER]
+
+    def _protected(self, seen: Outstanding) -> Mask:
+        """Where targets are: there the background learns nothing."""
+        mask = np.zeros(seen.clear.shape, np.uint8)
+        for thing in self._things:
+            if thing.life in (Life.SEEN, Life.CARRIED):
+                _fill(mask, thing.quad, seen.grid_from_frame, 1)
+        return mask > 0
+
+    def _blind(self, reason: str) -> list[Track]:
+        """A frame in which nothing can be seen: the targets are lost, or end."""
+        for thing in self._things:
+            if thing.life is not Life.NEW:
+                thing.life, thing.reason = Life.LOST, reason
+                thing.lost_s += self._step_s
+            thing.time_s = self._time_s
+        self._things = [
+            thing
+            for thing in self._things
+            if thing.life is not Life.NEW and thing.lost_s <= _COAST_S
+        ]
+        return self._tracks()
+
+    def _broken_off(
+        self, world_from_small: Matrix, small: Image, small_from_frame: Matrix
+    ) -> list[Track]:
+        """Most of the picture changed at once: a flash, or another scene if it stays so."""
+        self._broken += 1
+        if self._broken < _BROKEN_FRAMES:
+            return self._blind("most of the picture changed at once")
+        self._things, self._broken = [], 0
+        self._background = BackgroundModel((small.shape[1], small.shape[0]), world_from_small)
+        seen = self._background.compare(small, world_from_small, small_from_frame)
+        nothing = np.zeros(seen.clear.shape, np.bool_)
+        self._background.learn(seen, nothing, nothing)
+        return []
+
+    def _tracks(self) -> list[Track]:
+        named = [thing for thing in self._things if thing.life is not Life.NEW]
+        named.sort(key=lambda thing: int(thing.name.rpartition("-")[2]))
+        return [self._track(thing, thing.box) for thing in named]
+
+    def _track(self, thing: Followed, box: Doubles) -> Track:
+        if thing.life is Life.LOST:
+            return Track(thing.name, TrackState.LOST, means="motion", reason=thing.reason)
+        assert thing.home is not None
+        x0, y0, x1, y1 = box
+        return Track(
+            thing.name,
+            TrackState.TRACKING,
+            quad=geometry.box_quad(x0, y0, x1 - x0, y1 - y0),
+            frame_from_template=_box_from_box(box, thing.home),
+            model=Model.AFFINE,
+            means="motion" if thing.life is Life.SEEN else "carried",
+        )
+
+
+def _own_things(things: Sequence[Followed], moment: _Moment) -> list[Followed]:
+    """Of things that share a blob those that are no fragments of the others.
+
+    Fragments were hardly ever seen alone, and move as the rest does.
+    """
+    elders = [thing for thing in things if thing.hits >= _ELDER_HITS]
+    first = max(things, key=lambda thing: thing.hits)
+    most_px = _ALIKE_PX * moment.grid_px
+    others = [
+        thing
+        for thing in things
+        if thing not in elders
+        and float(np.hypot(*(thing.velocity - first.velocity))) * moment.step_s > most_px
+    ]
+    return [*(elders or [first]), *(thing for thing in others if thing is not first)]
+
+
+def _carry(thing: Followed, scene: Scene, moment: _Moment) -> float:
+    """Move a thing as the pixels in its place do; the share of it that stands out."""
+    found = _motion_within(scene, thing.box)
+    if found is None:
+        return 0.0
+    moved, share = found
+    if share >= _CARRYING_SHARE:
+        thing.carry(moved, moment.step_s)
+    return share
+
+
+def _is_over(thing: Followed, size_wh: Size) -> bool:
+    if thing.life is Life.NEW:
+        return thing.misses > _MAX_MISSES
+    if thing.life is not Life.LOST:
+        return thing.life is Life.OVER
+    middle, size = thing.center, np.array(size_wh)
+    is_outside = bool((middle < 0).any() or (middle > size - 1).any())
+    edges = touched_edges(thing.box, size_wh)
+    outward = np.concatenate([thing.velocity < 0, thing.velocity > 0])
+    return is_outside or bool((edges & outward).any()) or thing.lost_s > _COAST_S
+
+
+def _reduced(view: FrameView) -> tuple[Image, Matrix]:
+    """The frame in colour at about `_WIDTH_PX`, and small_from_frame."""
+    width, height = view.size_wh
+    step = max(1, round(max(width, height) / _WIDTH_PX))
+    size = max(1, width // step), max(1, height // step)
+    image = view.frame.image
+    if image.ndim == 2:
+        image = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
+    if step > 1:
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return image, geometry.scaling(size[0] / width, size[1] / height)
+
+
+def _is_invertible(matrix: Matrix) -> bool:
+    try:
+        return bool(np.isfinite(geometry.inverted(matrix)).all())
+    except np.linalg.LinAlgError:
+        return False
+
+
+def _moving(scene: Scene) -> Mask:
+    """Which pixels (h, w) of the grid are not at rest against the background."""
+    if scene.motion is None:
+        return np.zeros(scene.solid.shape, np.bool_)
+    x, y = cv2.split(scene.motion)
+    return np.asarray(cv2.magnitude(x, y) > _REST_PX, np.bool_)
+
+
+def _hidden(seen: Outstanding, given: Sequence[Track]) -> Mask:
+    """The places of the targets that were given."""
+    mask = np.zeros(seen.clear.shape, np.uint8)
+    for track in given:
+        if track.quad is not None and np.isfinite(track.quad).all():
+            middle = track.quad.mean(axis=0)
+            _fill(mask, middle + np.float32(1.15) * (track.quad - middle), seen.grid_from_frame, 1)
+    return mask > 0
+
+
+def _fill(mask: Image, quad: npt.NDArray[np.float32], grid_from_frame: Matrix, value: int) -> None:
+    outline = geometry.transform_points(grid_from_frame, quad)
+    if np.isfinite(outline).all():
+        cv2.fillConvexPoly(mask, np.rint(np.clip(outline, -1e5, 1e5)).astype(np.int32), value)
+
+
+def _motion_within(scene: Scene, box: Doubles) -> tuple[Doubles, float] | None:
+    """Median motion (2,), frame px, of what stands out within a box, and its share of the box."""
+    if scene.motion is None:
+        return None
+    corners = geometry.transform_points(scene.grid_from_frame, box.reshape(2, 2))
+    height, width = scene.solid.shape
+    if not np.isfinite(corners).all():
+        return None
+    x0, y0, x1, y1 = np.rint(np.clip(corners.ravel(), -1e5, 1e5)).astype(int).tolist()
+    window = slice(max(0, y0), min(height, y1 + 1)), slice(max(0, x0), min(width, x1 + 1))
+    inside = scene.solid[window]
+    count = int(np.count_nonzero(inside))
+    if count < 6:
+        return None
+    frame_from_grid = geometry.inverted(scene.grid_from_frame)
+    scale = geometry.local_scale(frame_from_grid, corners.mean(axis=0).astype(np.float64))
+    moved = np.median(scene.motion[window][inside], axis=0).astype(np.float64) * scale
+    return moved, count / max(1, (x1 - x0 + 1) * (y1 - y0 + 1))
+
+
+def _hold_to_edges(things: Sequence[Followed], blob: Blob) -> None:
+    """Shift the outermost things of a shared blob so that they end where it ends."""
+    for axis in (0, 1):
+        first = min(things, key=lambda thing: float(thing.box[axis]))
+        last = max(things, key=lambda thing: float(thing.box[axis + 2]))
+        for thing, edge in ((first, axis), (last, axis + 2)):
+            off = float(blob.box[edge] - thing.box[edge])
+            if abs(off) <= 0.25 * float(thing.size[axis]):
+                thing.box[[axis, axis + 2]] += 0.3 * off
+
+
+def _has_moved(thing: Followed, frame_px: float) -> bool:
+    """Has it come far enough, straight enough, and did its own pixels move that way?"""
+    moved = thing.center - thing.origin
+    far = float(np.hypot(*moved))
+    if far < max(_MOVED_PX * frame_px, _MOVED_SHARE * float(np.hypot(*thing.size))):
+        return False
+    if far < _STRAIGHT_SHARE * thing.path_px:
+        return False
+    if thing.flow_px is None:
+        return True
+    return float(thing.flow_px @ moved) >= _FLOWED_SHARE * far * far
+
+
+def _box_from_box(box: Doubles, home: Doubles) -> Matrix:
+    """The upright affinity that takes one box to another."""
+    factor = (box[2:] - box[:2]) / np.maximum(home[2:] - home[:2], 1e-6)
+    shift = box[:2] - factor * home[:2]
+    return np.array([[factor[0], 0.0, shift[0]], [0.0, factor[1], shift[1]], [0.0, 0.0, 1.0]])

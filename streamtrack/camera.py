@@ -17,7 +17,6 @@ import numpy as np
 
 from streamtrack import geometry
 from streamtrack.fitting import fit
-from streamtrack.fixed_camera import FixedCamera
 from streamtrack.frame_view import FrameView
 from streamtrack.keyframes import KeyframeGraph
 from streamtrack.loops import LevelCache, LoopCloser, NewKeyframe, link_of, overlapping
@@ -40,78 +39,23 @@ _MAX_AREA_JUMP = 1.5
 _MAX_STRETCH = 4.0
 _MAX_STEPS_AHEAD = 8
 _REFERENCES_KEPT = 6
-_STILL_PX = 2.0
-_STILL_FRAMES = 25
 
 
 class CameraEstimator(Protocol):
-    """What the pipeline asks of a camera model."""
+    """What a run asks of a camera model."""
+
+    @property
+    def graph(self) -> KeyframeGraph | None:
+        """The keyframes, whose poses may still change until `close`; None if there are none."""
+        ...
 
     def update(self, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
         """The camera's pose in the next frame; ``tracks`` are its targets, which may move."""
         ...
 
-
-def make_camera(settings: Settings, *, is_live: bool = False) -> CameraEstimator:
-    """The camera model that the settings ask for.
-
-    ``is_live`` closes loops in a thread of its own, so that no frame waits for it.
-    """
-    if settings.camera == "moving":
-        return MovingCamera(settings, is_threaded=is_live)
-    if settings.camera == "auto":
-        return AutoCamera(settings, is_threaded=is_live)
-    return FixedCamera()
-
-
-class AutoCamera:
-    """Finds out whether the camera stands or moves, and goes on as the one or the other.
-
-    It moves until it has stood for a while; a camera that stands and is found elsewhere at two
-    checks, each time somewhere else, moves after all.
-    """
-
-    def __init__(self, settings: Settings, *, is_threaded: bool = False) -> None:
-        self._moving = MovingCamera(settings, is_threaded=is_threaded)
-        self._fixed = FixedCamera()
-        self._frames_still = 0
-        self._last_moved_px = 0.0
-        self.is_fixed = False
-
-    @property
-    def graph(self) -> KeyframeGraph:
-        """The keyframes; one alone as long as the camera stands."""
-        return self._moving.graph
-
-    def update(self, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
-        """The camera's pose in the next frame: just the identity while it stands."""
-        fixed = self._fixed.update(view, tracks)
-        if self.is_fixed and not self._is_off():
-            return fixed
-        self.is_fixed = False
-        pose = self._moving.update(view, tracks)
-        world_from_frame = pose.world_from_frame
-        if world_from_frame is not None:
-            quad = geometry.image_quad(view.size_wh)
-            off_px = float(np.max(np.abs(geometry.transform_points(world_from_frame, quad) - quad)))
-            self._frames_still = self._frames_still + 1 if off_px < _STILL_PX else 0
-        self.is_fixed = self._frames_still >= _STILL_FRAMES
-        if self.is_fixed:
-            self._frames_still, self._last_moved_px = 0, self._fixed.moved_px
-        return pose
-
     def close(self) -> None:
-        """Finish the work on loops."""
-        self._moving.close()
-
-    def _is_off(self) -> bool:
-        """True if the camera went on moving between two checks: nobody just bumped it once."""
-        moved_px = self._fixed.moved_px
-        if abs(moved_px - self._last_moved_px) <= _STILL_PX:
-            return False
-        is_off = self._last_moved_px > _STILL_PX
-        self._last_moved_px = moved_px
-        return is_off
+        """Finish what is still at work; poses are final then."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,6 +1,7 @@
 """A camera on a tripod: the world is the picture, and whether that is still so is checked.
 
-Now and then a frame is aligned with the first one, at reduced resolution. If its corners have
+Every few frames a glance tells whether the picture has shifted (`standing`); then, and now and
+then anyway, a frame is aligned with the first one, at reduced resolution. If its corners have
 moved, the frames since the check before are gone through for the first that had. The pose stays
 the identity all the same, as it is what was asked for; its ``warning`` says what is wrong.
 """
@@ -15,14 +16,16 @@ import numpy as np
 
 from streamtrack import geometry
 from streamtrack.frame_view import FrameView
+from streamtrack.keyframes import KeyframeGraph
+from streamtrack.standing import StandCheck
 from streamtrack.types import CameraPose, Frame, Image, Points, Track
 from streamtrack.view_alignment import align
 from streamtrack.view_levels import ReferenceView, ViewLevels
 
 _EVERY = 25  # frames between two checks
+_GLANCE_EVERY = 5
 _LONGEST_PX = 320
 _MOVED_PX = 1.5
-_MIN_TEXTURED_CELLS = 12
 _UNKNOWN_CHECKS = 3  # in a row that recognise nothing, before it is said
 
 
@@ -38,13 +41,18 @@ class _Small:
 class FixedCamera:
     """A camera that stands; ``every`` says how many frames lie between two checks."""
 
+    graph: KeyframeGraph | None = None
+
     def __init__(self, every: int = _EVERY) -> None:
         self._every = every
         self._reference: ReferenceView | None = None
+        self._glance: StandCheck | None = None
         self._recent: deque[_Small] = deque(maxlen=every)
         self._frames = 0
+        self._glanced = -every
         self._unknown = 0
         self._unknown_since = 0
+        self._moved_at = 0
         self._warning = ""
         self.moved_px = 0.0
         """How far the corner that moved most is from where it was, by the last check."""
@@ -59,15 +67,34 @@ class FixedCamera:
         else:
             self._recent.append(small)
             self._frames += 1
-            if self._frames % self._every == 0:
+            if self._frames % self._every == 0 or self._looks_moved(small, step):
                 self._check(small, step)
         return CameraPose(np.eye(3), warning=self._warning)
 
+    def close(self) -> None:
+        """Nothing is left to do."""
+
     def _start(self, small: _Small) -> None:
         levels = ViewLevels(small.image)
-        reference = ReferenceView(levels, small.hidden)
-        if not levels.is_flat() and reference.textured_cells >= _MIN_TEXTURED_CELLS:
-            self._reference = reference
+        glance = StandCheck(levels, small.hidden)
+        if glance.is_possible:
+            self._reference, self._glance = glance.reference, glance
+
+    def _looks_moved(self, small: _Small, step: int) -> bool:
+        """Whether a check is due at once; after one that found nothing none is for a while."""
+        if self._glance is None or self._warning or self._frames % _GLANCE_EVERY:
+            return False
+        if self._frames - self._glanced < self._every or not self._fits(small):
+            return False
+        levels = ViewLevels(small.image)
+        if levels.is_flat() or self._glance.of(levels, small.hidden).moved_px * step <= _MOVED_PX:
+            return False
+        self._glanced = self._frames
+        return True
+
+    def _fits(self, small: _Small) -> bool:
+        assert self._reference is not None
+        return (small.image.shape[1], small.image.shape[0]) == self._reference.size_wh
 
     def _check(self, small: _Small, step: int) -> None:
         moved_px = self._moved_px(small, step)
@@ -82,9 +109,10 @@ class FixedCamera:
         self.moved_px = moved_px
         if moved_px <= _MOVED_PX:
             self._warning = ""
-        elif not self._warning.startswith("camera moved"):
-            first = self._first_moved(step, max(_MOVED_PX, moved_px / 2))
-            self._warning = f"camera moved at frame {first} by {moved_px:.1f} px"
+        else:
+            if not self._warning.startswith("camera moved"):
+                self._moved_at = self._first_moved(step, max(_MOVED_PX, moved_px / 2))
+            self._warning = f"camera moved at frame {self._moved_at} by {moved_px:.1f} px"
 
     def _first_moved(self, step: int, limit_px: float) -> int:
         """Index of the first of the last frames that lies as far off, by halving."""
@@ -102,7 +130,7 @@ class FixedCamera:
     def _moved_px(self, small: _Small, step: int) -> float | None:
         """How far the frame's corners are from the first frame's, None if it shows another view."""
         assert self._reference is not None
-        if (small.image.shape[1], small.image.shape[0]) != self._reference.size_wh:
+        if not self._fits(small):
             return None
         levels = ViewLevels(small.image)
         found = align(self._reference, levels, np.eye(3), small.hidden)

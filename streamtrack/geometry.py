@@ -162,6 +162,14 @@ def visible_share(quad: npt.ArrayLike, size_wh: Size) -> float:
     return clipped_quad_area(quad, size_wh) / area if area > 0 else 0.0
 
 
+def quad_mapping(a: npt.ArrayLike, b: npt.ArrayLike) -> Matrix:
+    """b_from_a that takes the quad a (4, 2) exactly to the quad b; no three corners in a line."""
+    import cv2
+
+    corners = np.asarray(a, np.float32), np.asarray(b, np.float32)
+    return np.asarray(cv2.getPerspectiveTransform(*corners), np.float64)
+
+
 def grey_of(image: Image) -> Image:
     """The picture as (H, W) grey."""
     import cv2

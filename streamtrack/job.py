@@ -13,7 +13,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Protocol
 
-from streamtrack.camera import CameraEstimator, MovingCamera, make_camera
+from streamtrack.auto_camera import make_camera
+from streamtrack.camera import CameraEstimator
 from streamtrack.errors import SourceError, StreamtrackError, UsageError
 from streamtrack.mosaic.picture_files import check_picture_path
 from streamtrack.pipeline import track
@@ -80,9 +81,9 @@ def run_track(job: TrackJob, progress: Progress, should_stop: Callable[[], bool]
         )
         builder = SummaryBuilder(source.info, job.settings)
         camera = make_camera(job.settings, is_live=source.info.is_live)
-        if isinstance(camera, MovingCamera):
+        if camera.graph is not None:
             stack.callback(camera.graph.close)
-            stack.callback(camera.close)
+        stack.callback(camera.close)
         steps = stack.enter_context(closing(_steps(job, source, camera)))
         # A target that does not fit the first frame is refused before any output is touched.
         first = next(steps, None)

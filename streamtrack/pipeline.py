@@ -10,8 +10,9 @@ import numpy as np
 
 from streamtrack import geometry
 from streamtrack.auto import AutoTargets
+from streamtrack.auto_camera import make_camera
 from streamtrack.budget import LEVELS, Budget
-from streamtrack.camera import CameraEstimator, make_camera
+from streamtrack.camera import CameraEstimator
 from streamtrack.errors import TargetError, UsageError
 from streamtrack.features import FeatureExtractor
 from streamtrack.frame_view import FrameView

@@ -17,7 +17,7 @@ import rerun as rr
 
 from streamtrack import blueprint, recorded_rows
 from streamtrack.blueprint import TargetEntities
-from streamtrack.geometry import box_quad, inverted, scaling, transform_points
+from streamtrack.geometry import box_quad, inverted, quad_mapping, scaling, transform_points
 from streamtrack.mosaic.types import MosaicView
 from streamtrack.recorded_video import jpeg_of
 from streamtrack.types import Image, Matrix, Points, Size, Step, TrackState
@@ -232,7 +232,7 @@ def _anchored(position: npt.NDArray[np.float32], outlines: npt.NDArray[np.float3
 
 
 def _from_unit(outline: npt.NDArray[np.float32]) -> Matrix:
-    return np.asarray(cv2.getPerspectiveTransform(_UNIT_SQUARE, outline), np.float64)
+    return quad_mapping(_UNIT_SQUARE, outline)
 
 
 def _mapped(b_from_a: Matrix, lines: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

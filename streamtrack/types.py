@@ -297,6 +297,13 @@ class Track:
             raise ValueError("quad and frame_from_template are given exactly while tracking")
 
 
+class CameraKind(StrEnum):
+    """What a camera does."""
+
+    FIXED = "fixed"
+    MOVING = "moving"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPose:
     """Where the camera looks: ``world_from_frame`` is None if unknown, with the reason.
@@ -304,6 +311,7 @@ class CameraPose:
     ``matches`` and ``inliers`` count the places that were compared and that agree. ``keyframe`` is
     the index of the keyframe that the frame was measured against, the frame's own if it became
     one. ``warning`` says what is wrong although the pose is given: a fixed camera that was moved.
+    ``kind`` is what `--camera auto` takes the camera for in this frame, None if it was told.
     """
 
     world_from_frame: Matrix | None
@@ -314,6 +322,7 @@ class CameraPose:
     keyframe: int | None = None
     is_keyframe: bool = False
     warning: str = ""
+    kind: CameraKind | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

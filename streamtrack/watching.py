@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from streamtrack.camera import CameraEstimator, MovingCamera
+from streamtrack.camera import CameraEstimator
 from streamtrack.errors import OutputError, StreamtrackError
 from streamtrack.results import PosesWriter, open_tracks_writer
 from streamtrack.settings import Settings
@@ -154,7 +154,7 @@ def _graph_in_full_size(
     camera: CameraEstimator, info: SourceInfo, settings: Settings
 ) -> PoseGraph | None:
     """The keyframes in the pixels of the frames as they come, whatever the work is done on."""
-    graph = camera.graph if isinstance(camera, MovingCamera) else None
+    graph = camera.graph
     if graph is None or settings.max_width is None:
         return graph
     return FullSizeGraph(graph, full_from_small(info.size_wh, settings.max_width))
@@ -185,8 +185,7 @@ def _add_mosaic(
                 display.log_mosaic(mosaic.view(), frame.index, frame.time_s)
 
     def finish(_summary: Summary) -> None:
-        if isinstance(camera, MovingCamera):
-            camera.close()  # from here on the poses are final
+        camera.close()  # from here on the poses are final
         mosaic.finish(path)
         for display in displays:
             for index, time_s in last:

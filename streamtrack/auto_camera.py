@@ -1,0 +1,167 @@
+"""Does the camera stand or move? Found out by what it does, and asked again in every frame.
+
+It moves until it has stood for a while. While it stands its pose does not change, and a glance at
+a small picture (`standing`) tells whether that is still so; what the glance doubts is estimated as
+for a moving camera, so a frame in which a tripod was bumped already has its true pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from streamtrack import geometry
+from streamtrack.camera import CameraEstimator, MovingCamera
+from streamtrack.fixed_camera import FixedCamera
+from streamtrack.frame_view import FrameView
+from streamtrack.keyframes import KeyframeGraph
+from streamtrack.settings import Settings
+from streamtrack.standing import StandCheck
+from streamtrack.types import CameraKind, CameraPose, Matrix, Points, Size, Track, Verdict
+from streamtrack.view_levels import ViewLevels
+
+_STILL_PX = 0.75
+"""Corners of a camera that stands are estimated within this distance of each other."""
+_DOUBT_PX = 0.5
+_STILL_FRAMES = 25
+_MOST_STILL_FRAMES = 400
+_RENEW_EVERY = 250  # frames, so that the light may change
+
+
+def make_camera(settings: Settings, *, is_live: bool = False) -> CameraEstimator:
+    """The camera model that the settings ask for.
+
+    ``is_live`` closes loops in a thread of its own, so that no frame waits for it.
+    """
+    if settings.camera == "moving":
+        return MovingCamera(settings, is_threaded=is_live)
+    if settings.camera == "auto":
+        return AutoCamera(settings, is_threaded=is_live)
+    return FixedCamera()
+
+
+@dataclass(slots=True, eq=False)
+class _Standing:
+    """A camera at rest: where, against a keyframe, what it sees, and how long that was believed."""
+
+    keyframe: int
+    keyframe_from_frame: Matrix
+    check: StandCheck
+    frames: int = 0
+
+    def pose(self, graph: KeyframeGraph) -> Matrix:
+        """world_from_frame, which is another once keyframes were moved."""
+        world_from_keyframe = graph.keyframes[self.keyframe].world_from_keyframe
+        return geometry.normalized(world_from_keyframe @ self.keyframe_from_frame)
+
+
+class AutoCamera:
+    """A camera of which it is found out whether it stands or moves, and when that changes."""
+
+    def __init__(self, settings: Settings, *, is_threaded: bool = False) -> None:
+        self._moving = MovingCamera(settings, is_threaded=is_threaded)
+        self._standing: _Standing | None = None
+        self._rest = _Rest()
+        self._needed = _STILL_FRAMES
+
+    @property
+    def graph(self) -> KeyframeGraph:
+        """The keyframes; one alone as long as the camera stands."""
+        return self._moving.graph
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether the camera stands, by what was seen last."""
+        return self._standing is not None
+
+    def update(self, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
+        """The camera's pose in the next frame; while it stands always the same."""
+        if self._standing is not None:
+            return self._glance(self._standing, view, tracks)
+        pose = self._moving.update(view, tracks)
+        if pose.world_from_frame is not None:
+            self._rest.add(pose.world_from_frame, view.size_wh)
+            if self._rest.frames >= self._needed and pose.keyframe is not None:
+                self._stand(pose.keyframe, view, tracks)
+        return replace(pose, kind=CameraKind.MOVING)
+
+    def close(self) -> None:
+        """Finish the work on loops."""
+        self._moving.close()
+
+    def _stand(self, keyframe: int, view: FrameView, tracks: Sequence[Track]) -> None:
+        """From here on the camera stands, if that can be watched."""
+        check = StandCheck(ViewLevels(view.grey), _hidden(tracks))
+        if check.is_possible:
+            world_from_keyframe = self.graph.keyframes[keyframe].world_from_keyframe
+            pose = self._rest.pose(view.size_wh)
+            keyframe_from_frame = geometry.inverted(world_from_keyframe) @ pose
+            self._standing = _Standing(keyframe, geometry.normalized(keyframe_from_frame), check)
+        self._rest = _Rest()
+
+    def _glance(self, standing: _Standing, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
+        """The pose of a camera that stood until now."""
+        levels, hidden = ViewLevels(view.grey), _hidden(tracks)
+        if levels.is_flat():
+            reason = str(Verdict.TOO_FEW_FEATURES)
+            return CameraPose(None, reason=reason, kind=CameraKind.FIXED)
+        standing.frames += 1
+        seen = standing.check.of(levels, hidden)
+        if seen.moved_px < _DOUBT_PX and standing.frames < _RENEW_EVERY:
+            stood = CameraPose(None, seen.pixels, seen.pixels, keyframe=standing.keyframe)
+            return self._unmoved(stood, standing, view)
+        found = self._moving.update(view, tracks)
+        if found.world_from_frame is None:
+            return replace(found, kind=CameraKind.FIXED)
+        pose = standing.pose(self.graph)
+        if _apart_px(found.world_from_frame, pose, view.size_wh) > _STILL_PX:
+            self._standing = None
+            self._needed = min(2 * self._needed, _MOST_STILL_FRAMES)
+            return replace(found, kind=CameraKind.MOVING)
+        check = StandCheck(levels, hidden)
+        if check.is_possible:
+            standing.check, standing.frames = check, 0
+        return self._unmoved(found, standing, view)
+
+    def _unmoved(self, found: CameraPose, standing: _Standing, view: FrameView) -> CameraPose:
+        if len(self.graph.keyframes) > 1:  # which may come to lie elsewhere, and the frame too
+            keyframe, keyframe_from_frame = standing.keyframe, standing.keyframe_from_frame
+            self.graph.add_frame(view.frame.index, keyframe, keyframe_from_frame)
+        pose = standing.pose(self.graph)
+        return replace(found, world_from_frame=pose, kind=CameraKind.FIXED)
+
+
+class _Rest:
+    """How long the estimated poses have been the same, and which one that is."""
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self._first: Matrix = np.eye(3)
+        self._corners = np.zeros((4, 2))
+
+    def add(self, world_from_frame: Matrix, size_wh: Size) -> None:
+        corners = geometry.transform_points(world_from_frame, geometry.image_quad(size_wh))
+        if not self.frames or _apart_px(world_from_frame, self._first, size_wh) > _STILL_PX:
+            self.frames, self._first, self._corners = 0, world_from_frame, np.zeros((4, 2))
+        self.frames += 1
+        self._corners += corners
+
+    def pose(self, size_wh: Size) -> Matrix:
+        """The mean pose; exactly the world's own if it is that."""
+        if _apart_px(self._first, np.eye(3), size_wh) <= _STILL_PX:
+            return np.eye(3)
+        mean = np.asarray(self._corners / self.frames, np.float32)
+        return geometry.quad_mapping(geometry.image_quad(size_wh), mean)
+
+
+def _hidden(tracks: Sequence[Track]) -> list[Points]:
+    return [track.quad for track in tracks if track.quad is not None]
+
+
+def _apart_px(one: Matrix, other: Matrix, size_wh: Size) -> float:
+    """How far apart two poses put the corner that differs most."""
+    quad = geometry.image_quad(size_wh)
+    off = geometry.transform_points(one, quad) - geometry.transform_points(other, quad)
+    return float(np.max(np.hypot(off[:, 0], off[:, 1])))

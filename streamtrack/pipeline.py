@@ -16,6 +16,7 @@ from streamtrack.camera import CameraEstimator
 from streamtrack.errors import TargetError, UsageError
 from streamtrack.features import FeatureExtractor
 from streamtrack.frame_view import FrameView
+from streamtrack.ground import make_ground
 from streamtrack.settings import Settings
 from streamtrack.sources.base import FrameSource
 from streamtrack.targets import (
@@ -28,7 +29,8 @@ from streamtrack.targets import (
 from streamtrack.template import make_template
 from streamtrack.tracker import DetectTracker, HybridTracker, TargetTracker
 from streamtrack.types import CameraPose, Frame, Step, Track
-from streamtrack.working_size import WorkingSize
+from streamtrack.working_size import WorkingSize, graph_in_full_size
+from streamtrack.world import WorldMotion
 
 _MAX_GAP_S = 1.0
 _POSE_AT_OTHER_SIZE = CameraPose(None, reason="the picture's size changed")
@@ -62,6 +64,8 @@ def track(
     auto = _make_auto(targets)
     trackers: list[TargetTracker] = []
     camera = camera or make_camera(settings, is_live=source.info.is_live)
+    graph = graph_in_full_size(camera.graph, source.info.size_wh, settings.max_width)
+    world = WorldMotion(graph, make_ground(settings.world))
     stop = None if frames is None else start + max(0, (frames - 1) * step + 1)
     is_first = True
     world_size_wh = (0, 0)
@@ -99,7 +103,7 @@ def track(
             stage_ms["camera"] = (camera_ended - camera_began) * 1e3
         budget.note(stage_ms["total"])
         step_seen = Step(view.frame, tracks, pose, view.detected, stage_ms, work.index)
-        yield working_size.full(frame, step_seen)
+        yield world.placed(working_size.full(frame, step_seen))
     if is_first and start > 0 and frames != 0:
         raise UsageError(f"the source has no frame {start}: it ended before")
 

@@ -17,7 +17,8 @@ import csv
 import io
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol, Self
@@ -37,7 +38,10 @@ class TrackRow(NamedTuple):
     """One target in one frame, in the order of the columns of CSV, JSON Lines and Parquet.
 
     Corners x1, y1 .. x4, y4 in full-resolution pixels, ``model`` and ``rmse_px`` are None unless
-    the state is tracking (``rmse_px`` also where it was not estimated).
+    the state is tracking (``rmse_px`` also where it was not estimated). ``world_x1 .. world_y4``
+    are the corners in pixels of the first keyframe and ``speed_px_s`` the speed there, None where
+    the camera's place is not known (the speed also in the first frames). The last three are in
+    the table only where a ground is given: place and speed in its units.
     """
 
     frame: int
@@ -56,14 +60,32 @@ class TrackRow(NamedTuple):
     matches: int
     inliers: int
     rmse_px: float | None
+    world_x1: float | None
+    world_y1: float | None
+    world_x2: float | None
+    world_y2: float | None
+    world_x3: float | None
+    world_y3: float | None
+    world_x4: float | None
+    world_y4: float | None
+    speed_px_s: float | None
+    ground_x: float | None
+    ground_y: float | None
+    speed_units_s: float | None
 
 
-TRACK_COLUMNS = TrackRow._fields
+GROUND_COLUMNS = ("ground_x", "ground_y", "speed_units_s")
+TRACK_COLUMNS = TrackRow._fields[: -len(GROUND_COLUMNS)]
+WORLD_COLUMNS = tuple(name for name in TRACK_COLUMNS if name.startswith("world_"))
 POSE_COLUMNS = (
     *("frame", "name", "time_s", "status", "reason"),
     *(f"h{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)),
 )
-_DECIMALS = dict.fromkeys(TRACK_COLUMNS[4:12], 3) | {"time_s": 6, "rmse_px": 4}
+_DECIMALS = (
+    dict.fromkeys((*TRACK_COLUMNS[4:12], *WORLD_COLUMNS, "speed_px_s"), 3)
+    | dict.fromkeys(GROUND_COLUMNS, 4)
+    | {"time_s": 6, "rmse_px": 4}
+)
 
 
 def track_rows(step: Step) -> list[TrackRow]:
@@ -73,19 +95,31 @@ def track_rows(step: Step) -> list[TrackRow]:
 
 def _track_row(step: Step, track: Track) -> TrackRow:
     quad = _finite_quad(track)
-    corners: list[float | None] = [None] * 8 if quad is None else [*quad]
-    x1, y1, x2, y2, x3, y3, x4, y4 = corners
-    return TrackRow(
+    cells: list[str | float | None] = [
         step.frame.index,
         _finite(step.frame.time_s),
         _encodable(track.name),
         track.state.value,
-        *(x1, y1, x2, y2, x3, y3, x4, y4),
+        *([None] * 8 if quad is None else quad),
         None if quad is None or track.model is None else track.model.value,
         len(track.evidence),
         track.evidence.inliers,
         None if quad is None else _finite(track.rmse_px),
-    )
+        *_world_cells(track),
+    ]
+    return TrackRow._make(cells)
+
+
+def _world_cells(track: Track) -> tuple[float | None, ...]:
+    """The cells from ``world_x1`` on."""
+    world = track.world
+    if world is None:
+        return (None,) * 12
+    corners = [float(value) for value in world.quad.ravel()]
+    if world.ground is None:
+        return (*corners, world.speed_px_s, None, None, None)
+    x, y = world.ground.position.tolist()
+    return (*corners, world.speed_px_s, x, y, world.ground.speed_units_s)
 
 
 def _finite_quad(track: Track) -> list[float] | None:
@@ -119,11 +153,9 @@ def _csv_cell(column: str, value: str | float | None) -> str:
     return f"{value:z.{_DECIMALS[column]}f}" if column in _DECIMALS else str(value)
 
 
-def _csv_lines(step: Step) -> str:
+def _csv_lines(step: Step, columns: Sequence[str]) -> str:
     return "".join(
-        _csv_line(
-            _csv_cell(column, value) for column, value in zip(TRACK_COLUMNS, row, strict=True)
-        )
+        _csv_line(_csv_cell(column, getattr(row, column)) for column in columns)
         for row in track_rows(step)
     )
 
@@ -132,9 +164,9 @@ def _json_value(column: str, value: str | float | None) -> str | float | None:
     return round(value, _DECIMALS[column]) if isinstance(value, float) else value
 
 
-def _json_lines(step: Step) -> str:
+def _json_lines(step: Step, columns: Sequence[str]) -> str:
     records = (
-        {column: _json_value(column, value) for column, value in row._asdict().items()}
+        {column: _json_value(column, getattr(row, column)) for column in columns}
         for row in track_rows(step)
     )
     return "".join(
@@ -198,11 +230,11 @@ class _TextTracksWriter(RecordFile):
 class _ParquetTracksWriter(Closing):
     """Rows wait as compact batches until they fill a row group: memory stays flat for weeks."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, columns: Sequence[str]) -> None:
         import pyarrow.parquet
 
         self._path = path
-        self._schema = _parquet_schema()
+        self._schema = _parquet_schema(columns)
         self._rows: list[TrackRow] = []
         self._batches: list[Any] = []
         self._file = io.BufferedWriter(open_output(path))
@@ -240,8 +272,10 @@ class _ParquetTracksWriter(Closing):
 
         if not self._rows:
             return
-        columns = zip(zip(*self._rows, strict=True), self._schema, strict=True)
-        arrays = [pa.array(column, field.type) for column, field in columns]
+        arrays = [
+            pa.array([getattr(row, field.name) for row in self._rows], field.type)
+            for field in self._schema
+        ]
         self._batches.append(pa.record_batch(arrays, schema=self._schema))
         self._rows.clear()
 
@@ -260,19 +294,25 @@ class _ParquetTracksWriter(Closing):
             self._file.close()
 
 
-def _parquet_schema() -> Any:
+def _parquet_schema(columns: Sequence[str]) -> Any:
     import pyarrow as pa
 
     types = {"frame": pa.int64(), "time_s": pa.float64(), "matches": pa.int32()}
     types |= {"inliers": pa.int32()} | dict.fromkeys(("target", "state", "model"), pa.string())
-    return pa.schema([(column, types.get(column, pa.float32())) for column in TRACK_COLUMNS])
+    # Places on the ground may be map coordinates, with more digits than float32 has.
+    types |= dict.fromkeys(GROUND_COLUMNS, pa.float64())
+    return pa.schema([(column, types.get(column, pa.float32())) for column in columns])
 
 
-_OPENERS: dict[str, Callable[[Path], TracksWriter]] = {
-    ".csv": lambda path: _TextTracksWriter(path, _csv_line(TRACK_COLUMNS), _csv_lines),
-    ".jsonl": lambda path: _TextTracksWriter(path, "", _json_lines),
+_OPENERS: dict[str, Callable[[Path, Sequence[str]], TracksWriter]] = {
+    ".csv": lambda path, columns: _TextTracksWriter(
+        path, _csv_line(columns), partial(_csv_lines, columns=columns)
+    ),
+    ".jsonl": lambda path, columns: _TextTracksWriter(
+        path, "", partial(_json_lines, columns=columns)
+    ),
     ".parquet": _ParquetTracksWriter,
-    ".txt": lambda path: _TextTracksWriter(path, "", _MotLines()),
+    ".txt": lambda path, _columns: _TextTracksWriter(path, "", _MotLines()),
 }
 
 
@@ -285,14 +325,14 @@ def check_tracks_path(path: Path) -> None:
         )
 
 
-def open_tracks_writer(path: Path) -> TracksWriter:
+def open_tracks_writer(path: Path, columns: Sequence[str] = TRACK_COLUMNS) -> TracksWriter:
     """A writer of tracks in the format of the file's ending, ready to be written to.
 
-    An existing file is replaced. Raises UsageError for an unknown ending, OutputError if the file
-    cannot be written.
+    ``columns`` are names of `TrackRow`; MOT text has its own. An existing file is replaced.
+    Raises UsageError for an unknown ending, OutputError if the file cannot be written.
     """
     check_tracks_path(path)
-    return _OPENERS[path.suffix.lower()](path)
+    return _OPENERS[path.suffix.lower()](path, columns)
 
 
 class PosesWriter(RecordFile):

@@ -157,6 +157,21 @@ class LiveSettings(_Section):
     rtsp_transport: Literal["tcp", "udp"] = "tcp"
 
 
+class WorldSettings(_Section):
+    """What a world pixel is on the ground; nothing of it is known unless given."""
+
+    px_per_unit: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    ground: tuple[tuple[float, float, float, float], ...] = Field(
+        default=(), description="known points: x, y in pixels of the first frame, X, Y in units"
+    )
+
+    @model_validator(mode="after")
+    def _check_one(self) -> Self:
+        if self.px_per_unit is not None and self.ground:
+            raise ValueError("a scale and known points contradict each other: give one of them")
+        return self
+
+
 class Settings(_Section):
     """All of them."""
 
@@ -170,6 +185,7 @@ class Settings(_Section):
     )
     recording: RecordingSettings = RecordingSettings()
     mosaic: MosaicSettings = MosaicSettings()
+    world: WorldSettings = WorldSettings()
     live: LiveSettings = LiveSettings()
 
 

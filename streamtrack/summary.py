@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from streamtrack.budget import LEVELS
+from streamtrack.camera_notes import CameraNotes
 from streamtrack.meters import LogHistogram, Mean, nearest_rank, peak_rss_mb
 from streamtrack.outputs import write_file
 from streamtrack.settings import Settings
@@ -137,6 +138,7 @@ class Summary:
     corrupt_packets: int
     ended: str
     live: LiveStatus | None = None
+    camera_notes: tuple[str, ...] = ()
 
     @property
     def fps(self) -> float | None:
@@ -169,6 +171,7 @@ class Summary:
             "blending": None,
             "method": self.settings.tracker.method,
             "camera": self.settings.camera,
+            "camera_notes": list(self.camera_notes),
             "frames_with_pose": self.frames_with_pose,
             "features": self.features,
             "matches": {"mean": self.matches, "median": self.matches_median},
@@ -198,9 +201,10 @@ class Summary:
         features = self.settings.features
         used = ", ".join(f"{model} {count}" for model, count in self.models.items())
         matches = f"mean {_number(self.matches, 1)}, median {_number(self.matches_median, 0)}"
-        camera = "fixed (assumed)"
-        if self.settings.camera != "fixed":
-            camera = f"{self.settings.camera}, known in {self.frames_with_pose} frames"
+        camera = f"{self.settings.camera}, known in {self.frames_with_pose} frames"
+        if self.settings.camera == "fixed":
+            camera = "fixed" if self.camera_notes else "fixed (checked)"
+        camera = "; ".join((camera, *self.camera_notes))
         ms = f"median {_number(self.ms_median, 1)} ms, p95 {_number(self.ms_p95, 1)} ms"
         return [
             ("Source", f"{self.source}, {self.size_wh[0]}x{self.size_wh[1]}"),
@@ -317,6 +321,7 @@ class SummaryBuilder:
         self._started = clock()
         self._frames = 0
         self._frames_with_pose = 0
+        self._camera = CameraNotes()
         self._features, self._inliers = Mean(), Mean()
         self._match_counts: Counter[int] = Counter()
         self._targets: dict[str, _TargetSums] = {}
@@ -334,6 +339,7 @@ class SummaryBuilder:
         self._frames += 1
         self._frames_at_level[step.work_level] += 1
         self._frames_with_pose += step.camera.world_from_frame is not None
+        self._camera.follow(step)
         if step.features is not None:
             self._features.add(len(step.features))
         for track in step.tracks:
@@ -387,4 +393,5 @@ class SummaryBuilder:
             corrupt_packets=corrupt_packets,
             ended=ended,
             live=live,
+            camera_notes=self._camera.all(),
         )

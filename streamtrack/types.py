@@ -18,10 +18,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from streamtrack.world import WorldPlace
 
 Image: TypeAlias = npt.NDArray[np.uint8]
 Points: TypeAlias = npt.NDArray[np.float32]
@@ -276,6 +279,7 @@ class Track:
     or the template picture. ``reason`` says in words why the target is not tracked, and is
     empty otherwise. ``means`` names the way the result was found (``flow``, ``guided``, ``global``,
     ``detect``); ``correlation`` is the normalised cross-correlation of target and picture, or NaN.
+    ``world`` is where it is in the world; None if that or the camera's pose is not known.
     """
 
     name: str
@@ -288,6 +292,7 @@ class Track:
     correlation: float = float("nan")
     means: str = ""
     reason: str = ""
+    world: WorldPlace | None = None
 
     def __post_init__(self) -> None:
         is_tracking = self.state is TrackState.TRACKING

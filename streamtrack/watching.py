@@ -6,6 +6,7 @@ the summary when the last one has gone by.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -14,18 +15,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from streamtrack.camera import CameraEstimator
+from streamtrack.camera_notes import CameraNotes
 from streamtrack.errors import OutputError, StreamtrackError
-from streamtrack.results import PosesWriter, open_tracks_writer
-from streamtrack.settings import Settings
+from streamtrack.results import GROUND_COLUMNS, TRACK_COLUMNS, PosesWriter, open_tracks_writer
+from streamtrack.settings import Settings, WorldSettings
 from streamtrack.sources.base import FrameSource
 from streamtrack.summary import Summary
 from streamtrack.types import Image, SourceInfo, Step
-from streamtrack.working_size import FullSizeGraph, full_from_small
+from streamtrack.working_size import graph_in_full_size
 
 if TYPE_CHECKING:
     from streamtrack.live_server import LiveAddress
     from streamtrack.live_view import LiveView
-    from streamtrack.mosaic.stream import PoseGraph, StreamMosaic
+    from streamtrack.mosaic.stream import StreamMosaic
     from streamtrack.recording import Recorder
     from streamtrack.sources.live import LiveSource
 
@@ -33,6 +35,7 @@ Watcher: TypeAlias = Callable[[Step], None]
 Finisher: TypeAlias = Callable[[Summary], None]
 
 _FALLBACK_RATE_HZ = 30.0
+_log = logging.getLogger("streamtrack.run")
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +96,11 @@ def open_watchers(
     if outputs.summary is not None:
         result.finishers.append(_summary_finisher(outputs.summary))
     if outputs.tracks is not None:
-        result.watchers.append(stack.enter_context(open_tracks_writer(outputs.tracks)).write)
+        columns = TRACK_COLUMNS
+        if settings.world != WorldSettings():
+            columns += GROUND_COLUMNS
+        tracks = stack.enter_context(open_tracks_writer(outputs.tracks, columns))
+        result.watchers.append(tracks.write)
     if outputs.poses is not None:
         poses = stack.enter_context(PosesWriter(outputs.poses))
         result.watchers.append(poses.write)
@@ -102,10 +109,11 @@ def open_watchers(
         result.watchers.append(_video_watcher(outputs.video, info, stack))
     displays = _open_displays(outputs, info, settings, views, stack, result)
     result.watchers.extend(display.log for display in displays)
+    result.watchers.append(_camera_watcher(settings))
     if outputs.mosaic is not None:
         from streamtrack.mosaic.stream import StreamMosaic
 
-        graph = _graph_in_full_size(camera, info, settings)
+        graph = graph_in_full_size(camera.graph, info.size_wh, settings.max_width)
         mosaic = stack.enter_context(StreamMosaic(settings.mosaic, graph))
         _add_mosaic(outputs.mosaic, mosaic, camera, displays, result)
     live = live_source(source)
@@ -113,6 +121,21 @@ def open_watchers(
         result.watchers.append(_live_watcher(live, displays))
     result.finishers.extend(_closer(display) for display in displays)
     return result
+
+
+def _camera_watcher(settings: Settings) -> Watcher:
+    """Says what the camera was found to be, and at once if it is not what it was said to be."""
+    notes = CameraNotes()
+    advice = "its place in the world is not known while that is so; --camera auto follows it"
+
+    def watch(step: Step) -> None:
+        note = notes.follow(step)
+        if note is not None and note.is_warning and settings.camera == "fixed":
+            _log.warning("%s: %s", note.text, advice)
+        elif note is not None:
+            _log.info("camera: %s", note.text)
+
+    return watch
 
 
 def live_source(source: FrameSource) -> LiveSource | None:
@@ -148,16 +171,6 @@ def _open_displays(
 
 def _closer(display: Recorder | LiveView) -> Finisher:
     return lambda summary: display.close(summary.to_markdown())
-
-
-def _graph_in_full_size(
-    camera: CameraEstimator, info: SourceInfo, settings: Settings
-) -> PoseGraph | None:
-    """The keyframes in the pixels of the frames as they come, whatever the work is done on."""
-    graph = camera.graph
-    if graph is None or settings.max_width is None:
-        return graph
-    return FullSizeGraph(graph, full_from_small(info.size_wh, settings.max_width))
 
 
 def _add_mosaic(

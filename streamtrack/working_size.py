@@ -148,6 +148,15 @@ class _FullKeyframe:
     world_from_keyframe: Matrix
 
 
+def graph_in_full_size(
+    graph: PoseGraph | None, size_wh: Size, max_width: int | None
+) -> PoseGraph | None:
+    """The keyframes in the pixels of frames of that size, whatever the work is done on."""
+    if graph is None or max_width is None:
+        return graph
+    return FullSizeGraph(graph, full_from_small(size_wh, max_width))
+
+
 class FullSizeGraph:
     """The keyframes of a camera that worked on smaller pictures, in pixels of the first frame."""
 

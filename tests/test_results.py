@@ -29,7 +29,10 @@ from streamtrack.types import (
     TrackState,
 )
 
-HEADER = "frame,time_s,target,state,x1,y1,x2,y2,x3,y3,x4,y4,model,matches,inliers,rmse_px"
+WORLD = [f"world_{axis}{corner}" for corner in "1234" for axis in "xy"] + ["speed_px_s"]
+HEADER = ",".join(
+    ["frame,time_s,target,state,x1,y1,x2,y2,x3,y3,x4,y4,model,matches,inliers,rmse_px", *WORLD]
+)
 ENDINGS = [".csv", ".jsonl", ".parquet", ".txt"]
 NASTY = ['a,b "c"', "two\nlines", "car\rriage", "=cmd()", "žluť 漢", "a|b"]
 IMAGE = np.zeros((8, 8, 3), np.uint8)
@@ -68,9 +71,9 @@ def test_csv_holds_one_row_a_target_a_frame(tmp_path: Path) -> None:
     assert path.read_text().splitlines() == [
         HEADER,
         "0,0.000000,board,tracking,1.062,2.000,11.062,2.000,11.062,22.000,1.062,22.000,"
-        "affine,3,2,0.2500",
-        "0,0.000000,car,lost,,,,,,,,,,0,0,",
-        "7,0.233333,board,lost,,,,,,,,,,0,0,",
+        "affine,3,2,0.2500,,,,,,,,,",
+        "0,0.000000,car,lost,,,,,,,,,,0,0,,,,,,,,,,",
+        "7,0.233333,board,lost,,,,,,,,,,0,0,,,,,,,,,,",
     ]
 
 
@@ -95,7 +98,8 @@ def test_json_lines_hold_the_same_keys_and_null(tmp_path: Path) -> None:
     assert rows[0]["target"] == NASTY[0]
     assert (rows[0]["time_s"], rows[0]["rmse_px"], rows[0]["x3"]) == (0.1, 0.25, 11.062)
     empty = {key for key, value in rows[1].items() if value is None}
-    assert empty == {"x1", "y1", "x2", "y2", "x3", "y3", "x4", "y4", "model", "rmse_px"}
+    corners = {"x1", "y1", "x2", "y2", "x3", "y3", "x4", "y4"}
+    assert empty == {*corners, "model", "rmse_px", *WORLD}
 
 
 def test_parquet_reads_back_with_nulls(tmp_path: Path) -> None:
@@ -232,7 +236,7 @@ def test_a_record_cut_by_a_full_disk_is_taken_back(tmp_path: Path) -> None:
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:
         with pytest.raises(OutputError, match="too large"), open_tracks_writer(path) as writer:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (500, limit[1]))
+            resource.setrlimit(resource.RLIMIT_FSIZE, (620, limit[1]))
             for index in range(100):
                 writer.write(_step(index, _tracked()))
     finally:

@@ -50,7 +50,30 @@ def track(
             "Results then depend on the machine's speed.",
         ),
     ] = None,
-    camera: Annotated[str | None, typer.Option(help="fixed or moving.")] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            help="fixed (watched, and said if it is not), moving, or auto: finds out, also when it "
+            "changes. Default fixed; auto where --mosaic, --poses, --scale or "
+            "--ground ask for the world.",
+        ),
+    ] = None,
+    scale: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PX_PER_UNIT",
+            help="World pixels in one unit (metre ...): adds ground_x, ground_y and "
+            "speed_units_s to --output.",
+        ),
+    ] = None,
+    ground: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="x,y=X,Y",
+            help="Where a pixel of the first frame lies on the ground, in units; four or more, "
+            "fitted by least squares. Adds the same columns.",
+        ),
+    ] = None,
     detector: Annotated[str | None, typer.Option(help=f"{DETECTORS}.")] = None,
     threshold: Annotated[float | None, typer.Option(help="The detector's own threshold.")] = None,
     descriptor: Annotated[str | None, typer.Option(help=f"{DESCRIPTORS}.")] = None,
@@ -115,6 +138,12 @@ def track(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
 ) -> None:
     """Follow targets through a video and write a recording, tables and a summary."""
+    from streamtrack.ground import make_ground, parse_ground
+    from streamtrack.settings import WorldSettings
+
+    known = parse_ground(ground) if ground else None
+    if scale is not None and known is not None:
+        raise UsageError("--scale and --ground contradict each other: give one of them")
     chosen = merged_settings(
         settings,
         {
@@ -123,10 +152,15 @@ def track(
             "tracker": {"method": method, "budget_ms": budget},
             "camera": camera,
             "max_width": max_width,
+            "world": {"px_per_unit": scale, "ground": known},
             "recording": {"video": record_video, "rotate": rotate, "keep": keep},
             "live": {"max_fps": max_fps, "retries": retries},
         },
     )
+    make_ground(chosen.world)  # what is wrong with the known points is said at once
+    is_world_wanted = bool(mosaic or poses or chosen.world != WorldSettings())
+    if is_world_wanted and "camera" not in chosen.model_fields_set:
+        chosen = chosen.model_copy(update={"camera": "auto"})
     from streamtrack.job import TrackJob, run_track
     from streamtrack.live_server import parse_live
     from streamtrack.targets import parse_targets

@@ -1,0 +1,209 @@
+"""Where targets are in the world, where they went there and how fast: camera and target together.
+
+A position is where the diagonals of a quad cross, which is the same point of a flat target however
+it is seen. Poses of a moving camera may change when a loop closes; positions of earlier frames
+then move with them, so that a path stays whole and no speed jumps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from streamtrack import geometry
+from streamtrack.ground import Ground
+from streamtrack.types import Frame, Matrix, Points, Step, Track
+
+if TYPE_CHECKING:
+    from streamtrack.mosaic.stream import PoseGraph
+
+_WINDOW_S = 0.5
+"""Velocities are means over this time."""
+_LEAST_POINTS = 3
+_LEAST_IN_WINDOW = 5  # where frames come slowly
+_MOST_WINDOW_S = 2.0
+_MOST_IN_WINDOW = 24
+_MOST_POINTS = 4096
+
+Doubles = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroundPlace:
+    """A target on the ground: ``position`` (2,), and its speed, None if unknown, in units."""
+
+    position: Doubles
+    speed_units_s: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WorldPlace:
+    """Where a target is in the world, the pixel frame of the first keyframe.
+
+    quad           float32 (4, 2), the corners in world pixels
+    position       float64 (2,), where its diagonals cross
+    velocity_px_s  float64 (2,), mean over the last half second; None until three frames were seen
+    ground         its place in units, None without a scale or beyond the horizon
+    """
+
+    quad: Points
+    position: Doubles
+    velocity_px_s: Doubles | None
+    ground: GroundPlace | None
+    _path: WorldPath
+    _frame: int
+
+    @property
+    def speed_px_s(self) -> float | None:
+        """World pixels a second."""
+        velocity = self.velocity_px_s
+        return None if velocity is None else float(np.hypot(*velocity))
+
+    @property
+    def path(self) -> Points:
+        """Its positions up to this frame, float32 (N, 2), oldest first, by today's poses."""
+        return self._path.points(self._frame)
+
+
+class WorldPath:
+    """The positions of one target; of very many, every second is let go."""
+
+    def __init__(self, graph: PoseGraph | None) -> None:
+        self._graph = graph
+        self._revision = 0 if graph is None else graph.revision
+        self._count = 0
+        self._frames = np.zeros(64, np.int64)
+        self._times_s = np.zeros(64)
+        self._in_frame = np.zeros((64, 2))
+        self._positions = np.zeros((64, 2))
+
+    def add(self, frame: Frame, in_frame: Doubles, position: Doubles) -> None:
+        """Add the position (2,) in a frame and in the world."""
+        if self._count == _MOST_POINTS:
+            self._thin()
+        elif self._count == len(self._frames):
+            self._grow()
+        row = self._count
+        self._frames[row], self._times_s[row] = frame.index, frame.time_s
+        self._in_frame[row], self._positions[row] = in_frame, position
+        self._count += 1
+
+    def _columns(self) -> dict[str, npt.NDArray[np.generic]]:
+        names = ("_frames", "_times_s", "_in_frame", "_positions")
+        return {name: getattr(self, name) for name in names}
+
+    def _grow(self) -> None:
+        for name, column in self._columns().items():
+            setattr(self, name, np.concatenate([column, np.zeros_like(column)]))
+
+    def _thin(self) -> None:
+        for name, column in self._columns().items():
+            setattr(self, name, np.concatenate([column[::2], np.zeros_like(column[1::2])]))
+        self._count = (self._count + 1) // 2
+
+    def points(self, last_frame: int) -> Points:
+        """Positions (N, 2) up to a frame, where they lie by what is known now."""
+        self._follow_keyframes()
+        count = int(np.searchsorted(self._frames[: self._count], last_frame, side="right"))
+        return self._positions[:count].astype(np.float32)
+
+    def recent(self) -> tuple[Doubles, Doubles]:
+        """Times (N,) and positions (N, 2) of the last moments, as far as they are used."""
+        self._follow_keyframes()
+        times = self._times_s[: self._count]
+        first = int(np.searchsorted(times, times[-1] - _WINDOW_S - 1e-9))
+        if self._count - first < _LEAST_IN_WINDOW:
+            earliest = int(np.searchsorted(times, times[-1] - _MOST_WINDOW_S))
+            first = max(self._count - _LEAST_IN_WINDOW, earliest, 0)
+        step = -(-(self._count - first) // _MOST_IN_WINDOW)
+        rows = slice(first + (self._count - 1 - first) % step, self._count, step)
+        return times[rows], self._positions[rows]
+
+    def _follow_keyframes(self) -> None:
+        graph = self._graph
+        if graph is None or graph.revision == self._revision:
+            return
+        self._revision = graph.revision
+        for row in range(self._count):
+            pose = graph.world_from_frame(int(self._frames[row]))
+            if pose is not None:
+                self._positions[row] = geometry.transform_points(pose, self._in_frame[row])[0]
+
+
+class WorldMotion:
+    """Puts the targets of each frame into the world; ``ground`` gives them units as well."""
+
+    def __init__(self, graph: PoseGraph | None = None, ground: Ground | None = None) -> None:
+        self._graph = graph
+        self._ground = ground
+        self._paths: dict[str, WorldPath] = {}
+
+    def placed(self, step: Step) -> Step:
+        """The step, its tracks with their place in the world, None while that is not known.
+
+        While a fixed camera warns that it was moved, nothing is known.
+        """
+        pose, frame = step.camera, step.frame
+        world_from_frame = None if pose.warning else pose.world_from_frame
+        if world_from_frame is None:
+            return step
+        tracks = tuple(self._placed(frame, track, world_from_frame) for track in step.tracks)
+        return replace(step, tracks=tracks)
+
+    def _placed(self, frame: Frame, track: Track, world_from_frame: Matrix) -> Track:
+        if track.quad is None:
+            return track
+        centre = crossing(track.quad)
+        quad = geometry.transform_points(world_from_frame, track.quad)
+        position = geometry.transform_points(world_from_frame, centre)[0].astype(np.float64)
+        if not (np.isfinite(quad).all() and np.isfinite(position).all()):
+            return track
+        if track.name not in self._paths:
+            self._paths[track.name] = WorldPath(self._graph)
+        path = self._paths[track.name]
+        path.add(frame, centre, position)
+        times, positions = path.recent()
+        velocity = _velocity(times, positions)
+        ground = self._on_ground(position, times, positions)
+        return replace(track, world=WorldPlace(quad, position, velocity, ground, path, frame.index))
+
+    def _on_ground(
+        self, position: Doubles, times: Doubles, positions: Doubles
+    ) -> GroundPlace | None:
+        if self._ground is None:
+            return None
+        here = self._ground.positions(position)[0]
+        if not np.isfinite(here).all():
+            return None
+        velocity = _velocity(times, self._ground.positions(positions))
+        return GroundPlace(here, None if velocity is None else float(np.hypot(*velocity)))
+
+
+def crossing(quad: Points) -> Doubles:
+    """Where the diagonals of a quad (4, 2) cross, (2,); its middle if they do not."""
+    (ax, ay), (bx, by), (cx, cy), (dx, dy) = quad.tolist()
+    across_x, across_y, down_x, down_y = cx - ax, cy - ay, dx - bx, dy - by
+    size = across_x * down_y - across_y * down_x
+    share = ((bx - ax) * down_y - (by - ay) * down_x) / size if size else 0.5
+    if not 0 <= share <= 1:
+        return np.asarray(quad.mean(axis=0), np.float64)
+    return np.array([ax + share * across_x, ay + share * across_y])
+
+
+def _velocity(times: Doubles, positions: Doubles) -> Doubles | None:
+    """Mean velocity (2,) from times (N,) and positions (N, 2), the median of all slopes.
+
+    Theil (1950) and Sen (1968): a third of the positions may be wrong. None if fewer than three
+    moments differ, or any position is not known.
+    """
+    if len(times) < _LEAST_POINTS or not np.isfinite(positions).all():
+        return None
+    earlier, later = np.triu_indices(len(times), 1)
+    apart = times[later] - times[earlier]
+    if np.count_nonzero(np.diff(times) > 0) < _LEAST_POINTS - 1:
+        return None
+    slopes = (positions[later] - positions[earlier])[apart > 0] / apart[apart > 0, None]
+    return np.asarray(np.median(slopes, axis=0), np.float64)

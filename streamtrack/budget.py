@@ -3,7 +3,8 @@
 Each level halves the area that is aligned and the features that are looked for; the lowest also
 search for lost targets only now and then. The level goes down when frames take longer than the
 budget and up again when there is room, so with a budget results depend on the machine's speed;
-without one they never do.
+without one they never do. A frame of a live source takes from when it lay ready: whatever keeps
+the run (writing, other programs), work goes down while it is late.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ _RATE = 0.25  # share of a new frame in the running mean
 _ROOM_SHARE = 0.55  # of the budget: a level costs at most about 1 / 0.6 of the next lower one
 _FRAMES_BEFORE_LESS = 3
 _FRAMES_BEFORE_MORE = 30
+_LONGEST_BEFORE_MORE = 960
 
 
 class Budget:
@@ -48,25 +50,36 @@ class Budget:
         self._level = 0
         self._mean_ms: float | None = None
         self._frames_at_level = 0
+        self._before_more = _FRAMES_BEFORE_MORE
+        self._has_risen = False
 
     @property
     def level(self) -> WorkLevel:
         return LEVELS[self._level]
 
     def note(self, frame_ms: float) -> None:
-        """Take in what a frame took at the present level."""
+        """Take in what a frame took at the present level, its waiting for us included."""
         if self._budget_ms is None:
             return
         mean = frame_ms if self._mean_ms is None else self._mean_ms
         self._mean_ms = mean + _RATE * (frame_ms - mean)
         self._frames_at_level += 1
         if self._mean_ms > self._budget_ms and self._frames_at_level >= _FRAMES_BEFORE_LESS:
-            self._go_to(min(self._level + 1, len(LEVELS) - 1))
+            self._lower()
         elif (
             self._mean_ms < _ROOM_SHARE * self._budget_ms
-            and self._frames_at_level >= _FRAMES_BEFORE_MORE
+            and self._frames_at_level >= self._before_more
         ):
+            self._has_risen = True
             self._go_to(max(self._level - 1, 0))
+
+    def _lower(self) -> None:
+        """A level that was tried and did not fit is tried again ever more rarely."""
+        is_failed_try = self._has_risen and self._frames_at_level < self._before_more
+        longer = min(2 * self._before_more, _LONGEST_BEFORE_MORE)
+        self._before_more = longer if is_failed_try else _FRAMES_BEFORE_MORE
+        self._has_risen = False
+        self._go_to(min(self._level + 1, len(LEVELS) - 1))
 
     def _go_to(self, level: int) -> None:
         if level != self._level:

@@ -101,7 +101,7 @@ def track(
             stage_ms["detect"] = view.detect_ms
         if settings.camera != "fixed":
             stage_ms["camera"] = (camera_ended - camera_began) * 1e3
-        budget.note(stage_ms["total"])
+        budget.note(stage_ms["total"] + frame.waited_s * 1e3)
         step_seen = Step(view.frame, tracks, pose, view.detected, stage_ms, work.index)
         yield world.placed(working_size.full(frame, step_seen))
     if is_first and start > 0 and frames != 0:

@@ -64,8 +64,9 @@ class Frame:
     packets that arrived since the frame before, if the source was opened to deliver them.
 
     Live sources tell when the picture was captured: ``captured_s`` on `time.monotonic`'s clock and
-    ``captured_unix_s`` as wall time. ``epoch`` counts how often the stream began anew: with it the
-    view, the size and the colours may be others.
+    ``captured_unix_s`` as wall time. ``waited_s`` is how long this picture, or one that was dropped
+    for it, lay ready while the caller was still busy: 0 if the caller keeps up. ``epoch`` counts
+    how often the stream began anew: with it the view, the size and the colours may be others.
     """
 
     index: int
@@ -76,6 +77,7 @@ class Frame:
     captured_s: float | None = None
     captured_unix_s: float | None = None
     epoch: int = 0
+    waited_s: float = 0.0
 
     def __post_init__(self) -> None:
         if self.image.dtype != np.uint8 or not (

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import FrameList
 
 from streamtrack.budget import LEVELS, Budget
 from streamtrack.evaluation import alignment_error
@@ -53,6 +55,30 @@ def test_work_is_raised_again_when_there_is_room() -> None:
     assert budget.level.index == 1, "no room: full work would not fit"
     _levels(budget, [3.0] * 100)
     assert budget.level.index == 0
+
+
+def test_work_that_does_not_fit_is_tried_ever_more_rarely() -> None:
+    """Full work takes too long, one step less has room to spare: no swinging to and fro."""
+    budget = Budget(10.0)
+    levels = []
+    for _ in range(3000):
+        levels.append(budget.level.index)
+        budget.note(12.0 if budget.level.index == 0 else 4.0)
+    rises = [n for n, (a, b) in enumerate(itertools.pairwise(levels)) if b < a]
+    waits = np.diff(rises)
+    assert len(rises) <= 8
+    assert list(waits) == sorted(waits)
+    assert levels.count(0) < 0.02 * len(levels)
+
+
+def test_lateness_lowers_the_work_although_tracking_is_quick() -> None:
+    source = SyntheticSource(_SCENE)
+    target = Target("t", np.asarray(source.truth(0).quad, np.float32))
+    settings = build_settings({"tracker": {"budget_ms": 2000.0}})
+    frames = [replace(source.frame(n), waited_s=0.0 if n < 8 else 9.0) for n in range(25)]
+    levels = [step.work_level for step in track(FrameList(frames), [target], settings)]
+    assert set(levels[:9]) == {0}
+    assert levels[-1] == LEVELS[-1].index
 
 
 def test_each_level_does_less() -> None:

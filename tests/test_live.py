@@ -19,7 +19,7 @@ import pytest
 from streamtrack.errors import SourceError, UsageError
 from streamtrack.meters import peak_rss_mb
 from streamtrack.settings import LiveSettings
-from streamtrack.sources import _backoff
+from streamtrack.sources import _backoff, _frame_queue
 from streamtrack.sources._arrival import ArrivalClock
 from streamtrack.sources._backoff import Backoff
 from streamtrack.sources._epoch_clock import EpochClock
@@ -544,6 +544,28 @@ def test_a_queue_gives_both_frames_after_a_hiccup_but_one_to_a_slow_reader() -> 
         queue.put(frame(index), may_drop=True)
     assert [f.index for f in (queue.get(lambda: False), queue.get(lambda: False)) if f] == [0, 1]
     assert queue.dropped == 0
+
+
+def test_a_frame_tells_how_long_it_or_those_dropped_for_it_waited(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now_s = 0.0
+    monkeypatch.setattr(_frame_queue, "monotonic", lambda: now_s)
+    queue = FrameQueue()
+    late = None
+    for _ in range(3):  # A reader that is always too slow, by two pictures.
+        for index in range(3):
+            queue.put(replace(frame(index), captured_s=0.0), may_drop=True)
+            now_s += 1.0
+        late = queue.get(lambda: False)
+    assert late is not None and (late.index, late.waited_s) == (2, 3.0)
+    queue.put(replace(frame(3), captured_s=0.0), may_drop=True)
+    prompt = queue.get(lambda: False)
+    assert prompt is not None and (prompt.index, prompt.waited_s) == (3, 0.0)
+    queue.put(frame(0), may_drop=False)  # Files are never late.
+    now_s += 1.0
+    read = queue.get(lambda: False, may_drop=False)
+    assert read is not None and read.waited_s == 0.0
 
 
 def test_a_closed_queue_wakes_a_waiting_writer() -> None:

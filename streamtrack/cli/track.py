@@ -46,8 +46,8 @@ def track(
         float | None,
         typer.Option(
             metavar="MS",
-            help="Keep the tracking time a frame near MS by doing less, in four stated levels. "
-            "Results then depend on the machine's speed.",
+            help="Keep the time a frame near MS by doing less, in four stated levels; of a live "
+            "source from when the frame lay ready. Results then depend on the machine's speed.",
         ),
     ] = None,
     camera: Annotated[

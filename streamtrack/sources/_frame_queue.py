@@ -6,6 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
+from time import monotonic
 
 from streamtrack.types import Frame, Packet
 
@@ -25,7 +26,7 @@ class FrameQueue:
 
     def __init__(self) -> None:
         self.keeps_packets = True
-        self._frames: deque[Frame] = deque()
+        self._frames: deque[tuple[Frame, float]] = deque()
         self._changed = threading.Condition()
         self._is_closed = False
         self._was_full = False
@@ -43,7 +44,7 @@ class FrameQueue:
                 self._changed.wait()
             if self._is_closed:
                 return
-            self._frames.append(frame)
+            self._frames.append((frame, monotonic()))
             if len(self._frames) > _CAPACITY:
                 self._drop_oldest()
             self._changed.notify_all()
@@ -63,7 +64,10 @@ class FrameQueue:
                 self._drop_oldest()
             self._was_full = is_full
             self._changed.notify_all()
-            return self._frames.popleft()
+            frame, ready_s = self._frames.popleft()
+            if frame.captured_s is None:
+                return frame  # of a file, which is never late
+            return replace(frame, waited_s=monotonic() - ready_s)
 
     def close(self) -> None:
         """No frame will come any more; those that wait can still be read."""
@@ -72,11 +76,12 @@ class FrameQueue:
             self._changed.notify_all()
 
     def _drop_oldest(self) -> None:
-        old = self._frames.popleft()
+        old, ready_s = self._frames.popleft()
+        new, _ = self._frames[0]
         self._dropped += 1
         if old.packets and self.keeps_packets:
-            new = self._frames[0]
-            self._frames[0] = replace(new, packets=_bounded((*old.packets, *new.packets)))
+            new = replace(new, packets=_bounded((*old.packets, *new.packets)))
+        self._frames[0] = new, ready_s
 
 
 def _bounded(packets: tuple[Packet, ...]) -> tuple[Packet, ...]:

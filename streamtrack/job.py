@@ -26,7 +26,7 @@ from streamtrack.sources.base import FrameSource
 from streamtrack.summary import Summary, SummaryBuilder
 from streamtrack.targets import TargetSpec, given_targets
 from streamtrack.types import SourceInfo, Step
-from streamtrack.watching import Outputs, live_source, open_watchers
+from streamtrack.watching import Outputs, Watchers, live_source, open_watchers
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +65,12 @@ def run_track(job: TrackJob, progress: Progress, should_stop: Callable[[], bool]
     """
     _check_outputs(job)
     service = ServiceNotifier()
+    watchers: Watchers | None = None
 
-    def is_over() -> bool:
-        service.alive()  # asked all the time, while a live source waits too
+    def is_over() -> bool:  # asked all the time, while a live source waits too
+        if watchers is not None:
+            watchers.wait()
+        service.alive("" if watchers is None or not service.is_used else watchers.status())
         return should_stop()
 
     with ExitStack() as stack:

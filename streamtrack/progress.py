@@ -84,6 +84,7 @@ class ProgressLines:
     def __init__(self, console: Console) -> None:
         self._console = console
         self._total: int | None = None
+        self._is_live = False
         self._done = 0
         self._began = self._last = time.monotonic()
 
@@ -95,6 +96,7 @@ class ProgressLines:
 
     def begin(self, info: SourceInfo, frames: int | None) -> None:
         self._total = frames
+        self._is_live = info.is_live
         self._began = self._last = time.monotonic()
 
     def advance(self, step: Step) -> None:
@@ -106,8 +108,9 @@ class ProgressLines:
         fps = self._done / (now - self._began)
         of = "" if self._total is None else f" of {self._total}"
         left = "" if self._total is None else f", {(self._total - self._done) / fps:.0f} s left"
+        missed = f", {step.frame.index + 1 - self._done} left out" if self._is_live else ""
         self._console.print(
-            f"{self._done}{of} frames, {fps:.1f} fps{left}; {_states(step)}",
+            f"{self._done}{of} frames, {fps:.1f} fps{left}{missed}; {_states(step)}",
             highlight=False,
             markup=False,
             soft_wrap=True,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -35,6 +36,9 @@ Watcher: TypeAlias = Callable[[Step], None]
 Finisher: TypeAlias = Callable[[Summary], None]
 
 _FALLBACK_RATE_HZ = 30.0
+_COUNTS_EVERY_S = 1.0
+_SHOWN_COUNTS = ("dropped", "thinned", "lost", "damaged")
+
 _log = logging.getLogger("streamtrack.run")
 
 
@@ -58,13 +62,24 @@ class Watchers:
     watchers: list[Watcher] = field(default_factory=list)
     finishers: list[Finisher] = field(default_factory=list)
     recorder: Recorder | None = None
+    live: LiveWatcher | None = None
 
     def watch(self, step: Step) -> None:
         for watcher in self.watchers:
             watcher(step)
 
+    def wait(self) -> None:
+        """To be called while no step comes: a live source may have something to say."""
+        if self.live is not None:
+            self.live.tell()
+
+    def status(self) -> str:
+        """How a live source does, in a few words; empty for others."""
+        return "" if self.live is None else str(self.live)
+
     def finish(self, summary: Summary) -> StreamtrackError | None:
         """Complete all outputs; returns what went wrong with one that did not stop the run."""
+        self.wait()
         failure: StreamtrackError | None = None
         for finisher in self.finishers:
             try:
@@ -118,7 +133,8 @@ def open_watchers(
         _add_mosaic(outputs.mosaic, mosaic, camera, displays, result)
     live = live_source(source)
     if live is not None:
-        result.watchers.append(_live_watcher(live, displays))
+        result.live = LiveWatcher(live, displays)
+        result.watchers.append(result.live.watch)
     result.finishers.extend(_closer(display) for display in displays)
     return result
 
@@ -208,18 +224,42 @@ def _add_mosaic(
     result.finishers.append(finish)
 
 
-def _live_watcher(source: LiveSource, displays: Sequence[Recorder | LiveView]) -> Watcher:
-    """Tells the displays how the source does, and the source when its frame is done with."""
+class LiveWatcher:
+    """Tells the displays how a live source does, and the source when its frame is done with."""
 
-    def watch(step: Step) -> None:
-        status = source.status()
-        counts = {name: getattr(status, name) for name in ("dropped", "lost", "damaged")}
-        for event in source.drain_events():
-            for display in displays:
-                display.log_source(str(event.state), counts, time_s=event.time_s)
-        source.note_output(step.frame)
+    def __init__(self, source: LiveSource, displays: Sequence[Recorder | LiveView]) -> None:
+        self._source = source
+        self._displays = displays
+        self._state = ""
+        self._counted_s = 0.0
 
-    return watch
+    def watch(self, step: Step) -> None:
+        """The last to watch a step."""
+        self._source.note_output(step.frame)
+        self.tell()
+
+    def tell(self) -> None:
+        """Changes of state at once, counts with them and once a second."""
+        events = self._source.drain_events()
+        now_s = time.monotonic()
+        if not events and now_s - self._counted_s < _COUNTS_EVERY_S:
+            return
+        self._counted_s = now_s
+        status = self._source.status()
+        counts = {name: getattr(status, name) for name in _SHOWN_COUNTS}
+        for display in self._displays:
+            for event in events:
+                display.log_source(str(event.state), time_s=event.time_s)
+        if events:
+            self._state = str(events[-1].state)
+        for display in self._displays:
+            display.log_source(self._state, counts)
+
+    def __str__(self) -> str:
+        """How the source does, in a few words."""
+        status = self._source.status()
+        counts = [f"{name} {getattr(status, name)}" for name in _SHOWN_COUNTS]
+        return f"{status.state}, {status.captured} pictures, {', '.join(counts)}"
 
 
 def _summary_finisher(path: Path) -> Finisher:

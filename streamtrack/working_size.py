@@ -51,7 +51,7 @@ class WorkingSize:
     def __init__(self, max_width: int | None) -> None:
         self._max_width = max_width
         self._first_wh: Size | None = None
-        self._of_first: set[str] = set()
+        self._from_pictures: set[str] = set()
 
     def small(self, frame: Frame) -> Frame:
         """The frame to work on."""
@@ -66,9 +66,9 @@ class WorkingSize:
         """
         assert self._first_wh is not None
         if target.picture is not None or target.quad is None:
+            self._from_pictures.add(target.name)
             return target
         check_quad_in_picture(target.name, target.quad, self._first_wh)
-        self._of_first.add(target.name)
         first = full_from_small(self._first_wh, self._max_width)
         quad = transform_points(inverted(first), target.quad)
         if least_side_px(quad) < MIN_SIDE_PX:
@@ -90,7 +90,7 @@ class WorkingSize:
             frame=frame,
             tracks=tuple(
                 replace(
-                    mapped_track(track, now, first if track.name in self._of_first else unchanged),
+                    mapped_track(track, now, unchanged if track.name in self._from_pictures else first),
                     rmse_px=track.rmse_px * _factor(now),
                 )
                 for track in step.tracks

@@ -37,6 +37,23 @@ def target() -> str:
     return ",".join(f"{value:.3f}" for value in SyntheticSource(SCENE).initial_quad.ravel())
 
 
+@pytest.mark.parametrize(
+    ("given", "parsed"),
+    [
+        ("clip.mp4 --live", "clip.mp4 --live="),
+        ("--live clip.mp4", "--live= clip.mp4"),
+        ("clip.mp4 --live --quiet", "clip.mp4 --live= --quiet"),
+        ("clip.mp4 --live 9000", "clip.mp4 --live 9000"),
+        ("--live 0.0.0.0:9000 clip.mp4", "--live 0.0.0.0:9000 clip.mp4"),
+        ("--live [::1]:9000", "--live [::1]:9000"),
+        ("--live=9000 x", "--live=9000 x"),
+        ("--output --live.csv", "--output --live.csv"),
+    ],
+)
+def test_the_live_address_may_be_left_out(given: str, parsed: str) -> None:
+    assert cli.with_live_address(given.split()) == parsed.split()
+
+
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     """Run the program in an empty folder and return its exit code."""

@@ -319,6 +319,7 @@ def test_a_silent_stream_is_given_up_and_opened_again() -> None:
         assert 0.1 < time.monotonic() - began < 1.5
         states = [e.state for e in source.drain_events()]
         assert source.status().stalls == 1
+        assert source.status().away_s > 0.1  # the silence before it was noticed counts
     assert first.is_closed
     assert [f.epoch for f in frames] == [0] * 3 + [1] * 3
     assert LiveState.STALLED in states

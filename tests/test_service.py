@@ -2,12 +2,20 @@ from __future__ import annotations
 
 import configparser
 import os
+import shlex
 import socket
+import sys
 from pathlib import Path
 
 import pytest
 
+import streamtrack.job
 import streamtrack.service as service
+import streamtrack.targets
+from streamtrack import cli
+from streamtrack.errors import UsageError
+from streamtrack.live_server import LiveAddress
+from streamtrack.rotation import parse_rotate
 from streamtrack.service import ServiceNotifier
 
 
@@ -111,7 +119,7 @@ def test_a_full_socket_blocks_nobody(tmp_path):
         assert 0 < len(received(receiver)) < 2000
 
 
-def test_the_unit_file_fits_the_service():
+def test_the_unit_file_fits_the_service(monkeypatch):
     path = Path(__file__).parent.parent / "scripts" / "streamtrack.service"
     unit = configparser.ConfigParser(strict=False, interpolation=None)
     unit.optionxform = str  # type: ignore[assignment,method-assign]
@@ -119,7 +127,21 @@ def test_the_unit_file_fits_the_service():
     assert unit["Service"]["Type"] == "notify"
     assert int(unit["Service"]["WatchdogSec"]) >= 10
     assert unit["Service"]["Restart"] == "always"
-    command = unit["Service"]["ExecStart"]
-    assert "streamtrack track" in command
-    assert "--rotate" in command
-    assert "--keep" in command
+    program, *arguments = shlex.split(unit["Service"]["ExecStart"])
+    assert program.endswith("/bin/streamtrack")
+    jobs = []
+
+    def run_track(job, progress, should_stop):
+        jobs.append(job)
+        raise UsageError("enough")
+
+    monkeypatch.setattr(streamtrack.job, "run_track", run_track)
+    monkeypatch.setattr(streamtrack.targets, "parse_targets", lambda texts: texts)
+    monkeypatch.setattr(sys, "argv", ["streamtrack", *arguments])
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert jobs, "its command line is refused"
+    assert jobs[0].source == "/dev/video0"
+    assert jobs[0].outputs.live == LiveAddress()
+    assert parse_rotate(jobs[0].settings.recording.rotate).age_s == 600
+    assert jobs[0].settings.recording.keep == "2GB"

@@ -6,6 +6,7 @@ Heavy modules are imported where they are used, so that --help is instant.
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -19,7 +20,9 @@ from streamtrack.cli.tools import synth, view
 from streamtrack.cli.track import track
 from streamtrack.errors import StreamtrackError, UsageError
 
-__all__ = ["app", "exit_on_error", "main"]
+_LIVE_ADDRESS = re.compile(r"(\S*:)?\d+")
+
+__all__ = ["app", "exit_on_error", "main", "with_live_address"]
 
 app = typer.Typer(
     name="streamtrack",
@@ -45,7 +48,20 @@ def main() -> None:
     os.environ.setdefault("MIMALLOC_PURGE_DELAY", "0")
     # Its matrices are small: threads for them only wait for each other, at full speed.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    exit_on_error(lambda: app(standalone_mode=False))
+    exit_on_error(lambda: app(with_live_address(sys.argv[1:]), standalone_mode=False))
+
+
+def with_live_address(arguments: list[str]) -> list[str]:
+    """The arguments with ``--live`` given its default where no address follows it.
+
+    Typer knows no options whose value may be left out.
+    """
+    given: list[str] = []
+    for place, argument in enumerate(arguments):
+        following = arguments[place + 1] if place + 1 < len(arguments) else ""
+        has_address = _LIVE_ADDRESS.fullmatch(following) is not None
+        given.append("--live=" if argument == "--live" and not has_address else argument)
+    return given
 
 
 def exit_on_error(run: Callable[[], Any]) -> None:

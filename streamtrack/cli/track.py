@@ -105,8 +105,9 @@ def track(
     live: Annotated[
         str | None,
         typer.Option(
-            metavar="[ADDRESS:]PORT",
-            help="Show the run as it goes in a browser or Rerun viewer; 9876 for 127.0.0.1:9876.",
+            metavar="[[ADDRESS:]PORT]",
+            help="Show the run as it goes, in a browser or Rerun viewer: at 127.0.0.1:9876 if no "
+            "address follows.",
         ),
     ] = None,
     rotate: Annotated[

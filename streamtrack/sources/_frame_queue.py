@@ -54,11 +54,10 @@ class FrameQueue:
 
         ``should_stop`` is asked ten times a second: a signal's handler may set what it looks at.
         """
+        while not self._has_one():
+            if self._is_closed or should_stop():
+                return None
         with self._changed:
-            while not self._frames:
-                if self._is_closed or should_stop():
-                    return None
-                self._changed.wait(_WAKE_S)
             is_full = len(self._frames) >= _CAPACITY
             if may_drop and is_full and self._was_full:
                 self._drop_oldest()
@@ -68,6 +67,13 @@ class FrameQueue:
             if frame.captured_s is None:
                 return frame  # of a file, which is never late
             return replace(frame, waited_s=monotonic() - ready_s)
+
+    def _has_one(self) -> bool:
+        """Waits a little for a frame; what is asked for in between is asked without the lock."""
+        with self._changed:
+            if not self._frames and not self._is_closed:
+                self._changed.wait(_WAKE_S)
+            return bool(self._frames)
 
     def close(self) -> None:
         """No frame will come any more; those that wait can still be read."""

@@ -86,6 +86,7 @@ class LiveSource:
         self._closing = threading.Event()
         self._journal = Journal()
         self._waited_s = 0.0
+        self._last_picture_s = 0.0
         self._epoch = -1
         self._next_index = 0
         self._size_wh: Size | None = None
@@ -223,7 +224,7 @@ class LiveSource:
                     if now_s - last_s >= self._settings.stall_timeout_s:
                         return self._stalled(now_s - last_s)
                     continue
-                last_s = now_s
+                last_s = self._last_picture_s = now_s
                 if now_s - began_s > max(_STEADY_S, self._waited_s):
                     self._backoff.reset()
                 self._take(captured)
@@ -313,7 +314,7 @@ class LiveSource:
         """Wait as the back-off says. Raises SourceError if no retry is left."""
         if self._closing.is_set():
             return
-        self._journal.begin_away()
+        self._journal.begin_away(self._last_picture_s)
         failures = self._backoff.failures + 1
         is_refused = isinstance(reason, CaptureRefusedError)
         delay_s = self._backoff.next_delay_s(is_refused=is_refused)

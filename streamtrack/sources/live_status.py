@@ -44,7 +44,7 @@ class LiveStatus:
     thinned          left out because of ``max_fps``
     lost, damaged    by the word of the device
     openings         that succeeded; ``reconnects`` is one less
-    away_s           time without a stream, after the first picture
+    away_s           time from the last picture before a loss to the first after it
     age_ms_p50, p95  from capture to `LiveSource.note_output`; None before the first
     """
 
@@ -108,11 +108,11 @@ class Journal:
             for what, number in numbers.items():
                 self._counts[what] += number
 
-    def begin_away(self) -> None:
-        """The stream is gone, if it was not already."""
+    def begin_away(self, since_s: float) -> None:
+        """The stream is gone, if it was not already, since `time.monotonic` was ``since_s``."""
         with self._lock:
             if self._away_since_s is None and self._counts["captured"]:
-                self._away_since_s = time.monotonic()
+                self._away_since_s = since_s
 
     def end_away(self) -> float:
         """The stream is back. For how many seconds it was gone."""

@@ -90,7 +90,9 @@ class WorkingSize:
             frame=frame,
             tracks=tuple(
                 replace(
-                    mapped_track(track, now, unchanged if track.name in self._from_pictures else first),
+                    mapped_track(
+                        track, now, unchanged if track.name in self._from_pictures else first
+                    ),
                     rmse_px=track.rmse_px * _factor(now),
                 )
                 for track in step.tracks

@@ -8,6 +8,7 @@ then move with them, so that a path stays whole and no speed jumps.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -147,6 +148,9 @@ class WorldMotion:
         While a fixed camera warns that it was moved, nothing is known.
         """
         pose, frame = step.camera, step.frame
+        names = {track.name for track in step.tracks}
+        if self._paths.keys() - names:  # targets that ended
+            self._paths = {name: path for name, path in self._paths.items() if name in names}
         world_from_frame = None if pose.warning else pose.world_from_frame
         if world_from_frame is None:
             return step
@@ -201,9 +205,17 @@ def _velocity(times: Doubles, positions: Doubles) -> Doubles | None:
     """
     if len(times) < _LEAST_POINTS or not np.isfinite(positions).all():
         return None
-    earlier, later = np.triu_indices(len(times), 1)
+    earlier, later = _pairs(len(times))
     apart = times[later] - times[earlier]
     if np.count_nonzero(np.diff(times) > 0) < _LEAST_POINTS - 1:
         return None
-    slopes = (positions[later] - positions[earlier])[apart > 0] / apart[apart > 0, None]
-    return np.asarray(np.median(slopes, axis=0), np.float64)
+    if apart.min() <= 0:
+        earlier, later, apart = (one[apart > 0] for one in (earlier, later, apart))
+    slopes = (positions[later] - positions[earlier]) / apart[:, None]
+    middle = len(slopes) // 2
+    return np.asarray(np.partition(slopes, middle, axis=0)[middle], np.float64)
+
+
+@lru_cache(maxsize=32)
+def _pairs(count: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    return np.triu_indices(count, 1)

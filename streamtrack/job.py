@@ -134,7 +134,7 @@ def _check_outputs(job: TrackJob) -> None:
         check_picture_path(outputs.mosaic)
     sources = [job.source] if isinstance(job.source, str) else job.source
     taken = {Path(source).resolve(): f"the source {source}" for source in sources}
-    for name in ("record", "tracks", "poses", "video", "summary", "mosaic"):
+    for name in ("record", "tracks", "poses", "video", "summary", "mosaic", "stabilized"):
         path = getattr(outputs, name)
         if path is None:
             continue

@@ -20,6 +20,7 @@ Descriptor: TypeAlias = Literal["freak", "brisk", "orb", "teblid", "sift", "akaz
 Method: TypeAlias = Literal["hybrid", "detect"]
 ModelChoice: TypeAlias = Literal["auto", "homography", "affine", "similarity", "translation"]
 CameraMode: TypeAlias = Literal["fixed", "moving", "auto"]
+StabilizePath: TypeAlias = Literal["smooth", "world"]
 Warping: TypeAlias = Literal["nearest", "linear", "cubic", "lanczos"]
 Blending: TypeAlias = Literal["none", "average", "feather", "multiband"]
 Projection: TypeAlias = Literal["auto", "planar", "cylindrical", "spherical"]
@@ -29,6 +30,7 @@ DESCRIPTORS: tuple[str, ...] = get_args(Descriptor)
 METHODS: tuple[str, ...] = get_args(Method)
 MODELS: tuple[str, ...] = get_args(ModelChoice)
 CAMERA_MODES: tuple[str, ...] = get_args(CameraMode)
+STABILIZE_PATHS: tuple[str, ...] = get_args(StabilizePath)
 WARPINGS: tuple[str, ...] = get_args(Warping)
 BLENDINGS: tuple[str, ...] = get_args(Blending)
 PROJECTIONS: tuple[str, ...] = get_args(Projection)
@@ -172,6 +174,15 @@ class WorldSettings(_Section):
         return self
 
 
+class StabilizeSettings(_Section):
+    """How a video is held still."""
+
+    path: StabilizePath = "smooth"
+    reach_s: float = Field(
+        default=0.8, gt=0, le=10, description="how far a smooth path looks back and ahead"
+    )
+
+
 class Settings(_Section):
     """All of them."""
 
@@ -186,6 +197,7 @@ class Settings(_Section):
     recording: RecordingSettings = RecordingSettings()
     mosaic: MosaicSettings = MosaicSettings()
     world: WorldSettings = WorldSettings()
+    stabilize: StabilizeSettings = StabilizeSettings()
     live: LiveSettings = LiveSettings()
 
 
@@ -196,6 +208,7 @@ _NAMES = {
     "model": MODELS,
     "camera": CAMERA_MODES,
     "video": tuple(VideoMode),
+    "path": STABILIZE_PATHS,
     "warping": WARPINGS,
     "blending": BLENDINGS,
     "projection": PROJECTIONS,

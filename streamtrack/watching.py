@@ -28,7 +28,7 @@ from streamtrack.working_size import graph_in_full_size
 if TYPE_CHECKING:
     from streamtrack.live_server import LiveAddress
     from streamtrack.live_view import LiveView
-    from streamtrack.mosaic.stream import StreamMosaic
+    from streamtrack.mosaic.stream import PoseGraph, StreamMosaic
     from streamtrack.recording import Recorder
     from streamtrack.sources.live import LiveSource
 
@@ -53,6 +53,7 @@ class Outputs:
     summary: Path | None = None
     mosaic: Path | None = None
     live: LiveAddress | None = None
+    stabilized: Path | None = None
 
 
 @dataclass(slots=True)
@@ -122,13 +123,15 @@ def open_watchers(
         result.finishers.append(_skipped_finisher(poses))
     if outputs.video is not None:
         result.watchers.append(_video_watcher(outputs.video, info, stack))
+    graph = graph_in_full_size(camera.graph, info.size_wh, settings.max_width)
+    if outputs.stabilized is not None:
+        _add_stabilized(outputs.stabilized, info, settings, graph, stack, result)
     displays = _open_displays(outputs, info, settings, views, stack, result)
     result.watchers.extend(display.log for display in displays)
     result.watchers.append(_camera_watcher(settings))
     if outputs.mosaic is not None:
         from streamtrack.mosaic.stream import StreamMosaic
 
-        graph = graph_in_full_size(camera.graph, info.size_wh, settings.max_width)
         mosaic = stack.enter_context(StreamMosaic(settings.mosaic, graph))
         _add_mosaic(outputs.mosaic, mosaic, camera, displays, result)
     live = live_source(source)
@@ -286,3 +289,35 @@ def _video_watcher(path: Path, info: SourceInfo, stack: ExitStack) -> Watcher:
         writer.write(draw_step(step, trail=trails.follow(step)), step.frame.time_s)
 
     return watch
+
+
+def _add_stabilized(
+    path: Path,
+    info: SourceInfo,
+    settings: Settings,
+    graph: PoseGraph | None,
+    stack: ExitStack,
+    result: Watchers,
+) -> None:
+    """Write the video held still; what a smooth path holds back comes at the end."""
+    from streamtrack.sources.writer import VideoWriter
+    from streamtrack.stabilizing import make_stabilizer
+
+    view = make_stabilizer(settings.stabilize, graph)
+    rate_hz = info.rate_hz or _FALLBACK_RATE_HZ
+    writer = stack.enter_context(VideoWriter(path, rate_hz=rate_hz))
+
+    def watch(step: Step) -> None:
+        for shown in view.add(step):
+            writer.write(shown.image, shown.time_s)
+
+    def finish(summary: Summary) -> None:
+        for shown in view.finish():
+            writer.write(shown.image, shown.time_s)
+        if view.unplaced:
+            _log.warning(
+                "%d of %d frames could not be placed in %s", view.unplaced, summary.frames, path
+            )
+
+    result.watchers.append(watch)
+    result.finishers.append(finish)

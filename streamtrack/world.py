@@ -46,7 +46,7 @@ class WorldPlace:
 
     quad           float32 (4, 2), the corners in world pixels
     position       float64 (2,), where its diagonals cross
-    velocity_px_s  float64 (2,), mean over the last half second; None until three frames were seen
+    velocity_px_s  float64 (2,), over the last half second (`mean_velocity`), None before frame 3
     ground         its place in units, None without a scale or beyond the horizon
     """
 
@@ -170,7 +170,7 @@ class WorldMotion:
         path = self._paths[track.name]
         path.add(frame, centre, position)
         times, positions = path.recent()
-        velocity = _velocity(times, positions)
+        velocity = mean_velocity(times, positions)
         ground = self._on_ground(position, times, positions)
         return replace(track, world=WorldPlace(quad, position, velocity, ground, path, frame.index))
 
@@ -182,7 +182,7 @@ class WorldMotion:
         here = self._ground.positions(position)[0]
         if not np.isfinite(here).all():
             return None
-        velocity = _velocity(times, self._ground.positions(positions))
+        velocity = mean_velocity(times, self._ground.positions(positions))
         return GroundPlace(here, None if velocity is None else float(np.hypot(*velocity)))
 
 
@@ -197,7 +197,7 @@ def crossing(quad: Points) -> Doubles:
     return np.array([ax + share * across_x, ay + share * across_y])
 
 
-def _velocity(times: Doubles, positions: Doubles) -> Doubles | None:
+def mean_velocity(times: Doubles, positions: Doubles) -> Doubles | None:
     """Mean velocity (2,) from times (N,) and positions (N, 2), the median of all slopes.
 
     Theil (1950) and Sen (1968): a third of the positions may be wrong. None if fewer than three
@@ -210,7 +210,8 @@ def _velocity(times: Doubles, positions: Doubles) -> Doubles | None:
     if np.count_nonzero(np.diff(times) > 0) < _LEAST_POINTS - 1:
         return None
     if apart.min() <= 0:
-        earlier, later, apart = (one[apart > 0] for one in (earlier, later, apart))
+        is_later = apart > 0
+        earlier, later, apart = earlier[is_later], later[is_later], apart[is_later]
     slopes = (positions[later] - positions[earlier]) / apart[:, None]
     middle = len(slopes) // 2
     return np.asarray(np.partition(slopes, middle, axis=0)[middle], np.float64)

@@ -54,7 +54,7 @@ def track(
         str | None,
         typer.Option(
             help="fixed (watched, and said if it is not), moving, or auto: finds out, also when it "
-            "changes. Default fixed; auto where --mosaic, --poses, --scale or "
+            "changes. Default fixed; auto where --mosaic, --stabilize, --poses, --scale or "
             "--ground ask for the world.",
         ),
     ] = None,
@@ -102,6 +102,17 @@ def track(
         Path | None,
         typer.Option(help="What the camera saw, without the targets: .png, .jpg, .tif."),
     ] = None,
+    stabilize: Annotated[
+        Path | None,
+        typer.Option(help="The video held still: .mp4, .mkv, .webm, .avi."),
+    ] = None,
+    stabilize_path: Annotated[
+        str | None,
+        typer.Option(
+            help="smooth (default): follows the camera's mean motion, cropped by 6 per cent a "
+            "side; world: the place that the first frame showed.",
+        ),
+    ] = None,
     live: Annotated[
         str | None,
         typer.Option(
@@ -143,6 +154,8 @@ def track(
     from streamtrack.settings import WorldSettings
 
     known = parse_ground(ground) if ground else None
+    if stabilize_path is not None and stabilize is None:
+        raise UsageError("--stabilize-path says how: give --stabilize FILE.mp4 as well")
     if scale is not None and known is not None:
         raise UsageError("--scale and --ground contradict each other: give one of them")
     chosen = merged_settings(
@@ -154,12 +167,13 @@ def track(
             "camera": camera,
             "max_width": max_width,
             "world": {"px_per_unit": scale, "ground": known},
+            "stabilize": {"path": stabilize_path},
             "recording": {"video": record_video, "rotate": rotate, "keep": keep},
             "live": {"max_fps": max_fps, "retries": retries},
         },
     )
     make_ground(chosen.world)  # what is wrong with the known points is said at once
-    is_world_wanted = bool(mosaic or poses or chosen.world != WorldSettings())
+    is_world_wanted = bool(mosaic or poses or stabilize or chosen.world != WorldSettings())
     if is_world_wanted and "camera" not in chosen.model_fields_set:
         chosen = chosen.model_copy(update={"camera": "auto"})
     from streamtrack.job import TrackJob, run_track
@@ -176,7 +190,9 @@ def track(
         source,
         parse_targets(target),
         chosen,
-        Outputs(None if no_record else record, output, poses, video, summary, mosaic, address),
+        Outputs(
+            None if no_record else record, output, poses, video, summary, mosaic, address, stabilize
+        ),
         start,
         step,
         frames,

@@ -10,7 +10,7 @@ Entities:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +22,14 @@ import rerun.blueprint as rrb
 
 from streamtrack import blueprint, recorded_rows
 from streamtrack.errors import OutputError
-from streamtrack.geometry import box_quad, inverted, scaling, transform_points
+from streamtrack.geometry import scaling, transform_points
 from streamtrack.mosaic.types import Link, Picture, Placement, Status
 from streamtrack.recorded_file import RecordingFiles, free_bytes, new_stream
 from streamtrack.recorded_video import jpeg_of
-from streamtrack.types import Image, Matrix, Points, Size, Verdict
+from streamtrack.types import Image, Points, Size, Verdict
 
 _TIMELINE = "picture"
-_MOSAIC_SIDE = 2048
+MOSAIC_SIDE = 2048
 _PICTURE_SIDE = 1024
 _PAIR_SIDE = 800
 _PAIR_GAP = 8
@@ -45,15 +45,16 @@ def record_picture_mosaic(
     pictures: Sequence[Picture],
     links: Sequence[Link],
     placements: Sequence[Placement],
-    mosaic: Image,
-    world_from_mosaic: Matrix,
+    mosaic: Image | None,
+    outlines: Mapping[int, Points],
     summary_markdown: str,
 ) -> None:
     """Write a mosaic of pictures, and all that led to it, to an .rrd file ready to be viewed.
 
-    ``mosaic`` is the picture that came of it, ``world_from_mosaic`` maps its pixels to the world of
-    the ``placements``. Pictures are recorded smaller than they are (mosaic 2048 px a side), of
-    many links those with the most inliers. Raises OutputError if the file cannot be written.
+    ``mosaic`` is the picture that came of it, None if none did; ``outlines`` (N, 2) run around the
+    pictures in its pixels, by picture index. Pictures are recorded smaller than they are (mosaic
+    2048 px a side), of many links those with the most inliers. Raises OutputError if the file
+    cannot be written.
     """
     shown = sorted(links, key=lambda link: -link.registration.inliers)[:_MAX_LINKS]
     shown.sort(key=lambda link: (link.verdict is not Verdict.OK, link.a, link.b))
@@ -65,7 +66,8 @@ def record_picture_mosaic(
     try:
         _log_styles(stream)
         stream.send_recording_name(f"Mosaic of {len(pictures)} pictures")
-        _log_mosaic(stream, mosaic, world_from_mosaic, pictures, placements)
+        if mosaic is not None:
+            _log_mosaic(stream, mosaic, outlines, placements)
         for picture in pictures:
             _log_picture(stream, picture)
         for link in shown:
@@ -97,27 +99,19 @@ def _log_styles(stream: rr.RecordingStream) -> None:
 def _log_mosaic(
     stream: rr.RecordingStream,
     mosaic: Image,
-    world_from_mosaic: Matrix,
-    pictures: Sequence[Picture],
+    outlines: Mapping[int, Points],
     placements: Sequence[Placement],
 ) -> None:
-    factor = _factor((mosaic.shape[1], mosaic.shape[0]), _MOSAIC_SIDE)
+    factor = _factor((mosaic.shape[1], mosaic.shape[0]), MOSAIC_SIDE)
     _log_image(stream, blueprint.MOSAIC_IMAGE, mosaic, factor)
-    shown_from_world = scaling(factor) @ inverted(world_from_mosaic)
-    sizes = {picture.index: picture.size_wh for picture in pictures}
-    outlines, names = [], []
-    for placement in placements:
-        pose, size_wh = placement.world_from_picture, sizes.get(placement.index)
-        if pose is not None and size_wh is not None:
-            outlines.append(transform_points(shown_from_world @ pose, _outline(size_wh)))
-            names.append(placement.name)
+    shown = [placement for placement in placements if placement.index in outlines]
     stream.log(
         "mosaic/outlines",
         rr.LineStrips2D(
-            outlines,
-            colors=[blueprint.target_color(number) for number in range(len(outlines))],
-            labels=names,
-            show_labels=len(names) <= _PICTURES_A_PAGE,
+            [transform_points(scaling(factor), outlines[one.index]) for one in shown],
+            colors=[blueprint.target_color(number) for number in range(len(shown))],
+            labels=[one.name for one in shown],
+            show_labels=len(shown) <= _PICTURES_A_PAGE,
             radii=blueprint.ui_points(1.0),
             draw_order=10.0,
         ),
@@ -187,7 +181,9 @@ def _log_lines(
         stream.log(blueprint.LOG, rr.TextLog(text, level="INFO"))
 
 
-def _layout(pictures: Sequence[Picture], links: Sequence[Link], mosaic: Image) -> rrb.Blueprint:
+def _layout(
+    pictures: Sequence[Picture], links: Sequence[Link], mosaic: Image | None
+) -> rrb.Blueprint:
     names = {picture.index: picture.name for picture in pictures}
     link_views = [
         rrb.Spatial2DView(
@@ -209,9 +205,10 @@ def _layout(pictures: Sequence[Picture], links: Sequence[Link], mosaic: Image) -
         *_pages(link_views, _LINKS_A_PAGE, "Matches"),
         *_pages(picture_views, _PICTURES_A_PAGE, "Pictures"),
     ]
-    mosaic_view = rrb.Spatial2DView(name="Mosaic", origin="/mosaic", contents="/mosaic/**")
-    is_wide = mosaic.shape[1] > 2 * mosaic.shape[0]
-    left: list[Any] = [mosaic_view, *([rrb.Tabs(*tabs, active_tab=0)] if tabs else [])]
+    is_wide = mosaic is not None and mosaic.shape[1] > 2 * mosaic.shape[0]
+    left: list[Any] = [rrb.Tabs(*tabs, active_tab=0)] if tabs else []
+    if mosaic is not None:
+        left.insert(0, rrb.Spatial2DView(name="Mosaic", origin="/mosaic", contents="/mosaic/**"))
     shares = [1.0, 1.0][: len(left)]
     views = (
         rrb.Vertical(*left, row_shares=shares)
@@ -263,11 +260,6 @@ def _short(text: str, length: int = 90) -> str:
 
 def _factor(size_wh: Size, side: int) -> float:
     return min(1.0, side / max(size_wh))
-
-
-def _outline(size_wh: Size) -> Points:
-    quad = box_quad(0, 0, size_wh[0] - 1, size_wh[1] - 1)
-    return np.concatenate([quad, quad[:1]])
 
 
 def _bgr(picture: Image) -> Image:

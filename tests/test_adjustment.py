@@ -10,6 +10,7 @@ import pytest
 
 from streamtrack import geometry
 from streamtrack.evaluation import corner_error
+from streamtrack.mosaic import bundle
 from streamtrack.mosaic.adjustment import adjust
 from streamtrack.mosaic.types import Link
 from streamtrack.types import Matches, Matrix, Model, Points, Registration, Size, Verdict
@@ -230,6 +231,16 @@ def test_pairs_on_one_line_leave_finite_poses() -> None:
     found = adjust({0: np.eye(3), 1: np.eye(3)}, links, {0: SIZE, 1: SIZE}, 0)
     seen = geometry.transform_points(found.world_from_picture[1], shifted)
     np.testing.assert_allclose(seen, line, atol=0.05)
+
+
+def test_sparse_and_dense_equations_have_one_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = flight(count=40, bend=0.004)
+    monkeypatch.setattr(bundle, "_DENSE_UNKNOWNS", 10**9)
+    dense = adjust(graph.start, graph.links, graph.sizes, 0, Model.HOMOGRAPHY)
+    monkeypatch.setattr(bundle, "_DENSE_UNKNOWNS", 0)
+    sparse = adjust(graph.start, graph.links, graph.sizes, 0, Model.HOMOGRAPHY)
+    for i, pose in dense.world_from_picture.items():
+        assert corner_error(sparse.world_from_picture[i], pose, SIZE) < 1e-3
 
 
 def test_two_runs_are_equal() -> None:

@@ -39,11 +39,15 @@ def run(
     output: str | None = "m.png",
     stop_after: int = 10**9,
     truth: Path | None = None,
+    record: Path | None = None,
     **mosaic: object,
 ) -> MosaicOutcome:
     asked = iter(range(10**9))
     outputs = MosaicOutputs(
-        None if output is None else folder / output, folder / "p.csv", folder / "s.json"
+        None if output is None else folder / output,
+        folder / "p.csv",
+        folder / "s.json",
+        record,
     )
     settings = build_settings({"mosaic": dict(mosaic)})
     job = MosaicJob(tuple(str(path) for path in inputs), settings, outputs, truth)
@@ -182,6 +186,51 @@ def test_outputs_agree_with_each_other(flight: list[Path], tmp_path: Path) -> No
     for label in ("Detector", "Features", "Matches", "Transformation model", "Warping", "Inliers"):
         assert printed[label]
     assert "within 3 px" in printed["Inliers"]
+
+
+@pytest.mark.parametrize("output", ["m.png", None])
+def test_the_recording_shows_mosaic_links_and_pictures(
+    flight: list[Path], stranger: Path, tmp_path: Path, output: str | None
+) -> None:
+    from rrd import rrd_columns, rrd_entities
+
+    record = tmp_path / "m.rrd"
+    outcome = run(tmp_path, [*flight[:2], stranger], output=output, record=record)
+    assert outcome.error is None
+    assert outcome.summary.canvas_wh is not None
+    assert (tmp_path / "m.png").exists() == (output is not None)
+    entities = set(rrd_entities(record))
+    assert {"/mosaic/image", "/links/0-1/matches", "/pictures/2/keypoints"} <= entities
+    (outlines,) = rrd_columns(record, "/mosaic/outlines", "LineStrips2D:strips", None)[1]
+    ends = np.concatenate([np.array(line) for line in outlines])
+    np.testing.assert_allclose(ends.min(axis=0), [-0.5, -0.5], atol=1.0)
+    np.testing.assert_allclose(ends.max(axis=0), outcome.summary.canvas_wh, atol=1.0)
+
+
+def test_a_recording_of_nothing_placed_shows_why(
+    flight: list[Path], stranger: Path, tmp_path: Path
+) -> None:
+    from rrd import rrd_columns, rrd_entities
+
+    record = tmp_path / "m.rrd"
+    outcome = run(tmp_path, [flight[0], stranger], record=record)
+    assert outcome.error is not None
+    assert "/links/0-1/image" in rrd_entities(record)
+    assert "/mosaic/image" not in rrd_entities(record)
+    log = [line for (line,) in rrd_columns(record, "/log", "TextLog:text", "picture")[1]]
+    assert any("stranger.png: skipped: no overlap" in line for line in log)
+
+
+def test_zoom_and_rotation_together_are_painted(ground: Image, tmp_path: Path) -> None:
+    # Three times as large and turned by 45 degrees, its box has 18 times the other's area.
+    places = [pose(450, 350), pose(450, 350, 45, 3.0)]
+    paths = [tmp_path / f"p{i}.png" for i in range(2)]
+    for path, place in zip(paths, places, strict=True):
+        cv2.imwrite(str(path), seen(ground, place))
+    outcome = run(tmp_path, paths)
+    assert outcome.error is None
+    assert outcome.summary.frames_used == 2
+    assert max(corner_errors(outcome, places, int(str(outcome.summary.reference)[1]))) < 3
 
 
 def test_truth_gives_recall_precision_and_corner_error(flight: list[Path], tmp_path: Path) -> None:

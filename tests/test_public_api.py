@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -43,6 +45,7 @@ def test_unknown_name_is_an_attribute_error() -> None:
         ("streamtrack.cli", ("cv2", "av", "rerun", "numpy", "pydantic", "rich")),
         ("streamtrack.sources", ("cv2", "av", "rerun")),
         ("streamtrack.pipeline", ("av", "rerun", "typer")),
+        ("streamtrack.mosaic.pictures", ("av", "rerun", "typer", "pyarrow", "rich", "scipy")),
         ("streamtrack.job", ("av", "rerun", "typer", "pyarrow")),
     ],
 )
@@ -54,3 +57,23 @@ def test_heavy_modules_are_imported_where_they_are_used(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert result.stdout.strip() == "[]"
+
+
+def test_all_that_is_imported_is_installed_with_the_package() -> None:
+    # Distributions are not always named as what they hold.
+    names = {
+        "cv2": "opencv-contrib-python-headless",
+        "rerun": "rerun-sdk",
+        "rerun_bindings": "rerun-sdk",
+    }
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
+    declared = {re.split(r"[<>=!~;\[ ]", line)[0] for line in project["dependencies"]}
+    imported: set[str] = set()
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                imported |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+                imported.add(node.module.split(".")[0])
+    outside = imported - sys.stdlib_module_names - {"streamtrack"}
+    assert {names.get(module, module) for module in outside} <= declared

@@ -205,9 +205,8 @@ def test_a_mosaic_of_pictures(tmp_path):
     pictures, placements = pictures_and_placements()
     links = [link_of(0, 1), link_of(1, 2, Verdict.TOO_FEW_INLIERS), link_of(0, 2, count=0)]
     mosaic = np.full((130, 230, 3), 90, np.uint8)
-    record_picture_mosaic(
-        path, pictures, links, placements, mosaic, translation(-5, -6), "# Mosaic"
-    )
+    outlines = {i: box_quad(5 + 40 * i, 6, 160, 120) for i in range(2)}
+    record_picture_mosaic(path, pictures, links, placements, mosaic, outlines, "# Mosaic")
     shown = rrd_columns(path, "/mosaic/image", BLOB, None)[1]
     assert cv2.imdecode(np.frombuffer(blob(shown[0]), np.uint8), 1).shape == (130, 230, 3)
     (outlines,) = rrd_columns(path, "/mosaic/outlines", STRIPS, None)[1]
@@ -235,7 +234,7 @@ def test_many_links_are_bounded(tmp_path):
     pictures = [Picture(i, f"{i}", picture(i), features(4)) for i in range(14)]
     links = [link_of(a, b, count=3 + a) for a in range(14) for b in range(a + 1, 14)]
     mosaic = np.zeros((3000, 20, 3), np.uint8)
-    record_picture_mosaic(path, pictures, links, [], mosaic, np.eye(3), "")
+    record_picture_mosaic(path, pictures, links, [], mosaic, {}, "")
     shown = {name for name in rrd_entities(path) if name.startswith("/links/") and "image" in name}
     assert len(shown) == 48
     assert "/links/12-13/image" in shown
@@ -243,10 +242,20 @@ def test_many_links_are_bounded(tmp_path):
     assert f"{len(links) - 48} of {len(links)} links are not shown as pictures" in log
 
 
+def test_without_a_mosaic_the_links_say_why(tmp_path):
+    path = tmp_path / "none.rrd"
+    pictures, placements = pictures_and_placements()
+    links = [link_of(0, 1, Verdict.TOO_FEW_INLIERS)]
+    record_picture_mosaic(path, pictures, links, placements, None, {}, "")
+    entities = set(rrd_entities(path))
+    assert "/links/0-1/image" in entities
+    assert "/mosaic/image" not in entities
+
+
 def test_an_unwritable_place_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     pictures, placements = pictures_and_placements()
     with pytest.raises(OutputError, match="recording"):
         record_picture_mosaic(
-            tmp_path / "file" / "x.rrd", pictures, [], placements, picture(0), np.eye(3), ""
+            tmp_path / "file" / "x.rrd", pictures, [], placements, picture(0), {}, ""
         )

@@ -62,7 +62,7 @@ def mosaic(
     poses: Annotated[Path | None, typer.Option(help="CSV of where each picture lies.")] = None,
     summary: Annotated[Path | None, typer.Option(help="Summary as JSON.")] = None,
     record: Annotated[
-        Path | None, typer.Option(help="Recording of a stream's mosaic as it grows (.rrd).")
+        Path | None, typer.Option(help="Recording for the Rerun viewer (.rrd).")
     ] = None,
     no_record: Annotated[bool, typer.Option("--no-record", help="Make no recording.")] = False,
     settings: Annotated[Path | None, typer.Option(help="Settings as TOML; flags win.")] = None,
@@ -106,7 +106,8 @@ def mosaic(
     ):
         outcome = run_mosaic(job, progress, stop)
     if not quiet:
-        plain_summary(outcome.summary.rows(), job.outputs.record)
+        is_recorded = record is not None and record.exists()
+        plain_summary(outcome.summary.rows(), record if is_recorded else None)
     if outcome.error is not None:
         raise outcome.error
 

@@ -38,7 +38,7 @@ from streamtrack.settings import Settings
 from streamtrack.types import Matrix, Model, Size
 
 _MAX_MAGNIFICATION = 15.0
-_MAX_VIEW_AREA = 12.0  # canvas pixels per picture pixel, of a picture's box on a plane
+_MAX_VIEW_AREA = 12.0  # of a picture's box on a plane, per area that its middle's scale gives it
 _TURNING_MISFIT = (1.3, 0.2)  # rotations may misfit by so much more than a plane: factor and px
 _ASKED_MISFIT = (2.0, 1.0)  # the same where the user says that the camera turned
 _WRONG_LINK_NOISES = 6.0
@@ -85,7 +85,7 @@ def arrange(links: Sequence[Link], sizes: Mapping[int, Size], settings: Settings
     inside = [link for link in sound if link.a in part.members]
     wanted = settings.mosaic.projection
     if len(part.members) == 2 and wanted in ("auto", "planar") and inside[0] in certain:
-        pair = _flat(_pair(inside[0], part), part, sizes, inside, contradicted)
+        pair = _best_flat(_pair(inside[0], part), part, sizes, inside, contradicted)
         if not pair.refused or wanted == "planar":
             return pair
     inside, part = _with_vouched(links, inside, sizes, part)
@@ -98,7 +98,7 @@ def arrange(links: Sequence[Link], sizes: Mapping[int, Size], settings: Settings
             return _turned(turning, kind, inside, contradicted)
     if plane is None or wanted in ("cylindrical", "spherical"):
         raise StreamtrackError(_no_surface(wanted))
-    return _flat(plane, part, sizes, inside, contradicted)
+    return _best_flat(plane, part, sizes, inside, contradicted)
 
 
 def _with_vouched(
@@ -203,6 +203,32 @@ def _plane(
     return found if len(found.world_from_picture) > 1 else None
 
 
+def _best_flat(
+    plane: Adjusted,
+    part: Part,
+    sizes: Mapping[int, Size],
+    links: Sequence[Link],
+    contradicted: Sequence[Link],
+) -> Arrangement:
+    """The plane of the part's centre, or of another picture if that holds more of them.
+
+    Seen from a picture taken at a slant the others may reach to the horizon, and not the other
+    way round.
+    """
+    best = _flat(plane, part, sizes, links, contradicted)
+    for picture in part.members:
+        if not best.refused:
+            break
+        if picture not in plane.world_from_picture:
+            continue
+        picture_from_world = geometry.inverted(plane.world_from_picture[picture])
+        poses = {i: picture_from_world @ m for i, m in plane.world_from_picture.items()}
+        turned = replace(plane, world_from_picture=poses)
+        found = _flat(turned, replace(part, centre=picture), sizes, links, contradicted)
+        best = found if len(found.refused) < len(best.refused) else best
+    return best
+
+
 def _flat(
     plane: Adjusted,
     part: Part,
@@ -240,14 +266,14 @@ def _refused_views(views: Mapping[int, View]) -> dict[int, str]:
     advice = "on a plane; --projection cylindrical or spherical may hold it"
     for picture, view in views.items():
         x0, y0, x1, y1 = view.bounds()
-        area = view.size_wh[0] * view.size_wh[1]
+        area = view.size_wh[0] * view.size_wh[1] * view.scale() ** 2
         if not np.all(np.isfinite([x0, y0, x1, y1])):
             refused[picture] = f"reaches the horizon {advice}"
         elif view.magnification() > _MAX_MAGNIFICATION:
             refused[picture] = f"would be stretched {view.magnification():.0f}-fold {advice}"
         elif view.kind == "planar" and (x1 - x0) * (y1 - y0) > _MAX_VIEW_AREA * area:
             times = (x1 - x0) * (y1 - y0) / area
-            refused[picture] = f"would cover {times:.0f} times its own area {advice}"
+            refused[picture] = f"would be drawn out over {times:.0f} times its area {advice}"
     return refused
 
 

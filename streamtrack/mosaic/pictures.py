@@ -6,10 +6,11 @@ read -> features -> links -> places -> canvas -> seams and brightness -> painted
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -32,6 +33,9 @@ from streamtrack.outputs import output_error
 from streamtrack.settings import Settings
 from streamtrack.types import Matrix
 
+if TYPE_CHECKING:
+    from streamtrack.mosaic.picture_record import SmallCopy
+
 _ABSURD_TIMES = 40  # canvas pixels per pixel of all pictures together
 _FEW_FEATURES = 10
 
@@ -43,6 +47,7 @@ class _Result:
     links: list[Link] = field(default_factory=list)
     arrangement: Arrangement | None = None
     canvas: Canvas | None = None
+    copy: SmallCopy | None = None
     overlap_ncc: float = float("nan")
     outside: str = ""
     notes: list[str] = field(default_factory=list)
@@ -79,7 +84,7 @@ def run_picture_mosaic(
     images = _placements(found, result)
     summary = _summary(job, found, result, images, truth)
     summary = _timed(summary, began, cpu_began)
-    failure = _write_tables(job, summary)
+    failure = _write_tables(job, summary) or _record(job, found, result, summary)
     return MosaicOutcome(summary, error or failure)
 
 
@@ -148,13 +153,21 @@ def _place_and_paint(
     settings = job.settings.mosaic
     planned = plan(canvas, found.thumbnails, found.covers, settings)
     result.overlap_ncc = planned.overlap_ncc
-    if job.outputs.image is None:
+    if job.outputs.image is None and job.outputs.record is None:
         result.canvas = canvas
         return
     count = band_count(canvas, settings)
     progress.begin("painting", None if count > 1 else len(canvas.patches))
     bands = painted_bands(planned, found.cache.read, settings, progress.advance)
-    result.outside = write_mosaic(job.outputs.image, canvas.size_wh, bands, count)
+    if job.outputs.record is not None:
+        from streamtrack.mosaic.picture_record import SmallCopy
+
+        result.copy = SmallCopy(canvas.size_wh)
+        bands = result.copy.watched(bands)
+    if job.outputs.image is not None:
+        result.outside = write_mosaic(job.outputs.image, canvas.size_wh, bands, count)
+    else:
+        deque(bands, maxlen=0)
     result.canvas = canvas
 
 
@@ -338,6 +351,20 @@ def _timed(summary: MosaicSummary, began: float, cpu_began: float) -> MosaicSumm
         cpu_s=time.process_time() - cpu_began,
         peak_rss_mb=peak_rss_mb(),
     )
+
+
+def _record(
+    job: MosaicJob, found: PictureSet, result: _Result, summary: MosaicSummary
+) -> StreamtrackError | None:
+    if job.outputs.record is None:
+        return None
+    from streamtrack.mosaic.picture_record import record_run
+
+    try:
+        record_run(job.outputs.record, found, result.links, result.canvas, result.copy, summary)
+    except StreamtrackError as error:
+        return error
+    return None
 
 
 def _write_tables(job: MosaicJob, summary: MosaicSummary) -> StreamtrackError | None:

@@ -145,6 +145,11 @@ class View:
         width, height = self.size_wh
         return bool(-0.5 <= x / depth <= width - 0.5 and -0.5 <= y / depth <= height - 0.5)
 
+    def outline(self) -> Doubles:
+        """The picture's border on the canvas as one closed line (N, 2)."""
+        top, bottom, left, right = np.split(_border(self.size_wh), 4)
+        return self.to_canvas(np.concatenate([top, right, bottom[::-1], left[::-1]]))
+
     def scale(self) -> float:
         """Canvas pixels per picture pixel at the picture's centre."""
         centre = (np.array(self.size_wh) - 1) / 2

@@ -33,12 +33,12 @@ _RENEW_EVERY = 250  # frames, so that the light may change
 def make_camera(settings: Settings, *, is_live: bool = False) -> CameraEstimator:
     """The camera model that the settings ask for.
 
-    ``is_live`` closes loops in a thread of its own, so that no frame waits for it.
+    ``is_live``: no frame waits for the thread that closes loops.
     """
     if settings.camera == "moving":
-        return MovingCamera(settings, is_threaded=is_live)
+        return MovingCamera(settings, is_live=is_live)
     if settings.camera == "auto":
-        return AutoCamera(settings, is_threaded=is_live)
+        return AutoCamera(settings, is_live=is_live)
     return FixedCamera()
 
 
@@ -60,8 +60,8 @@ class _Standing:
 class AutoCamera:
     """A camera of which it is found out whether it stands or moves, and when that changes."""
 
-    def __init__(self, settings: Settings, *, is_threaded: bool = False) -> None:
-        self._moving = MovingCamera(settings, is_threaded=is_threaded)
+    def __init__(self, settings: Settings, *, is_live: bool = False) -> None:
+        self._moving = MovingCamera(settings, is_live=is_live)
         self._standing: _Standing | None = None
         self._rest = _Rest()
         self._needed = _STILL_FRAMES

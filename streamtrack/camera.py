@@ -18,8 +18,9 @@ import numpy as np
 from streamtrack import geometry
 from streamtrack.fitting import fit
 from streamtrack.frame_view import FrameView
+from streamtrack.keyframe_links import LevelCache, NewKeyframe, link_of, overlapping
 from streamtrack.keyframes import KeyframeGraph
-from streamtrack.loops import LevelCache, LoopCloser, NewKeyframe, link_of, overlapping
+from streamtrack.loops import LoopCloser
 from streamtrack.mosaic.types import Link
 from streamtrack.relocalising import Relocaliser
 from streamtrack.settings import Settings
@@ -88,16 +89,17 @@ class MovingCamera:
     ``graph`` holds the keyframes; its poses may still change until `close`.
     """
 
-    def __init__(self, settings: Settings, *, is_threaded: bool = False) -> None:
+    def __init__(self, settings: Settings, *, is_live: bool = False) -> None:
         self.graph = KeyframeGraph()
         self._levels = LevelCache(self.graph)
-        self._loops = LoopCloser(self.graph, self._levels, is_threaded)
+        self._loops = LoopCloser(self.graph, is_live)
         self._relocaliser = Relocaliser(self.graph, settings)
         self._references: dict[int, ReferenceView] = {}
         self._state: _State | None = None
 
     def update(self, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
         """The camera's pose in the next frame; targets' quads are left out of account."""
+        self._loops.advance()
         levels = ViewLevels(view.grey)
         hidden = [track.quad for track in tracks if track.quad is not None]
         state = self._state
@@ -223,11 +225,12 @@ class MovingCamera:
         world_from_frame: Matrix,
     ) -> int | None:
         """A keyframe taken earlier that sees nearly all of the frame, and agrees with it."""
-        shares = overlapping(self.graph, world_from_frame, view.size_wh, _MIN_REUSED_OVERLAP)
+        keyframes = self.graph.keyframes
+        shares = overlapping(keyframes, world_from_frame, view.size_wh, _MIN_REUSED_OVERLAP)
         for _, other in shares[:1]:
             if other == keyframe:
                 continue
-            pose = self.graph.keyframes[other].world_from_keyframe
+            pose = keyframes[other].world_from_keyframe
             guess = geometry.normalized(geometry.inverted(pose) @ world_from_frame)
             found = align(self._reference(other), levels, guess, hidden)
             if found.reference_from_view is not None:
@@ -243,27 +246,29 @@ class MovingCamera:
         keyframe: int,
         found: ViewAlignment,
     ) -> bool:
-        """Take the frame as a keyframe if it is sharp and stands the exact alignment, too."""
+        """Take the frame as a keyframe if it is sharp and its place beyond doubt.
+
+        It is measured exactly later, unless so little agrees that it must be done at once.
+        """
         if not self._may_be_keyframe(found, view.size_wh):
             return False
         assert found.reference_from_view is not None
         index = view.frame.index
         reference = ReferenceView(levels, hidden)
-        guess = geometry.inverted(found.reference_from_view)
-        exact = align_exactly(reference, self._levels.get(keyframe), guess)
-        if exact.reference_from_view is not None:
+        keyframe_from_frame, link = found.reference_from_view, link_of(index, keyframe, found)
+        is_sure = found.inliers >= _MIN_AGREEING_CELLS
+        if not is_sure:
+            guess = geometry.inverted(found.reference_from_view)
+            exact = align_exactly(reference, self._levels.get(keyframe), guess)
+            if exact.reference_from_view is None:
+                return False
             keyframe_from_frame = geometry.inverted(exact.reference_from_view)
             link = link_of(keyframe, index, exact)
-        elif found.inliers >= _MIN_AGREEING_CELLS:
-            keyframe_from_frame = found.reference_from_view
-            link = link_of(index, keyframe, found)
-        else:
-            return False
         world_from_keyframe = self.graph.keyframes[keyframe].world_from_keyframe
         world_from_frame = geometry.normalized(world_from_keyframe @ keyframe_from_frame)
         self._take(view, reference, world_from_frame, link)
         self._go_over(index, np.eye(3))
-        self._loops.add(NewKeyframe(index, reference, keyframe))
+        self._loops.add(NewKeyframe(index, reference, keyframe, found if is_sure else None))
         return True
 
     def _take(

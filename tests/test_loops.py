@@ -21,9 +21,9 @@ LOOP = "flight?size=320x240&frames=64&step=36"
 SETTINGS = build_settings({"camera": "moving"})
 
 
-def fly(clip: Clip, is_threaded: bool = False) -> tuple[MovingCamera, list[CameraPose]]:
+def fly(clip: Clip, is_live: bool = False) -> tuple[MovingCamera, list[CameraPose]]:
     extractor = FeatureExtractor(SETTINGS.features)
-    camera = MovingCamera(SETTINGS, is_threaded=is_threaded)
+    camera = MovingCamera(SETTINGS, is_live=is_live)
     found = [camera.update(FrameView(frame, extractor), ()) for frame in clip.frames]
     camera.close()
     return camera, found
@@ -82,14 +82,14 @@ def test_every_frame_hangs_on_a_keyframe(
 
 def test_a_thread_of_its_own_finds_the_same_world(make_clip: MakeClip) -> None:
     clip = make_clip(LOOP, 64)
-    camera, found = fly(clip, is_threaded=True)
+    camera, found = fly(clip, is_live=True)
     assert all(pose.world_from_frame is not None for pose in found)
     errors = final_errors(clip, camera)
     assert np.mean(errors) < 1.5 and errors[-1] < 0.5
 
 
 def test_closing_twice_is_harmless(make_clip: MakeClip) -> None:
-    camera, _ = fly(make_clip(LOOP, 8), is_threaded=True)
+    camera, _ = fly(make_clip(LOOP, 8), is_live=True)
     before = camera.graph.poses()
     camera.close()
     for index, pose in camera.graph.poses().items():
@@ -99,7 +99,7 @@ def test_closing_twice_is_harmless(make_clip: MakeClip) -> None:
 def test_a_failure_in_the_thread_is_not_lost(
     make_clip: MakeClip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("streamtrack.loops.overlapping", lambda *_: 1 / 0)
+    monkeypatch.setattr("streamtrack.keyframe_links.overlapping", lambda *_: 1 / 0)
     clip = make_clip(LOOP, 64)
     with pytest.raises(ZeroDivisionError):
-        fly(clip, is_threaded=True)
+        fly(clip, is_live=True)

@@ -67,7 +67,7 @@ class _Run:
         if job.outputs.record is not None:
             self._recorder = stack.enter_context(self._open_recorder(job.outputs.record))
         self._extractor = FeatureExtractor(job.settings.features)
-        self._camera = MovingCamera(self._settings, is_threaded=source.info.is_live)
+        self._camera = MovingCamera(self._settings, is_live=source.info.is_live)
         stack.callback(self._camera.graph.close)
         stack.callback(self._camera.close)
         self._mosaic = stack.enter_context(StreamMosaic(job.settings.mosaic, self._camera.graph))

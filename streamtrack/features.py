@@ -28,7 +28,8 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack.errors import UsageError
-from streamtrack.geometry import scaling, transform_points
+from streamtrack.feature_pyramid import Band, level_count, part_of_pyramid, pyramid, quotas
+from streamtrack.geometry import transform_points
 from streamtrack.settings import FeatureSettings
 from streamtrack.types import Features, Image, Points
 
@@ -42,8 +43,7 @@ COMPATIBLE = {
 }
 """Descriptors that fit each detector. ORB's needs ORB's octaves, AKAZE's its own scale space."""
 
-PYRAMID_STEP = 2**0.5
-_MIN_LEVEL_PX = 48
+_BAND_MARGIN_PX = 32
 _MIN_PICTURE_PX = 16
 _CORNER_SIZE_PX = 7.0
 _SPREAD_CELLS = 12
@@ -105,31 +105,42 @@ class FeatureExtractor:
             return self._extract_from_pyramid(grey, mask)
         return self._extract_with_own_scale(grey, mask)
 
-    def extract_half(self, grey: Image, half: int) -> Features:
-        """About half of what `extract` would find, at half the cost; ``half`` says which.
+    def extract_part(self, grey: Image, part: int) -> Features:
+        """One of the parts of what `extract` would find, at little cost; ``part`` counts in turns.
 
-        Even ones see the finest level of the pyramid, odd ones all others, so that a search
-        over several frames sees everything and no frame takes long. Detectors with a scale of
-        their own cannot be halved and give all.
+        A part is one level of the pyramid, a band of a large one, or all the small ones together:
+        a search over several frames sees everything, and no frame takes long. Detectors with a
+        scale of their own cannot be divided and give all.
         """
         if self._settings.detector not in _CORNERS or min(grey.shape) < _MIN_PICTURE_PX:
             return self.extract(grey)
-        levels = slice(0, 1) if half % 2 == 0 else slice(1, None)
-        found = self._extract_from_pyramid(grey, None, levels)
-        return found if len(found) else self.extract(grey)
+        return self._extract_from_pyramid(
+            grey, None, part_of_pyramid((grey.shape[1], grey.shape[0]), part)
+        )
 
     def _extract_from_pyramid(
-        self, grey: Image, mask: Image | None, chosen: slice = slice(None)
+        self, grey: Image, mask: Image | None, bands: Sequence[Band] | None = None
     ) -> Features:
-        levels = _pyramid(grey)
-        quotas = _quotas(len(levels), self._settings.max_features)
+        deepest = None if bands is None else max(band.level for band in bands)
+        levels = pyramid(grey, deepest)
+        if bands is None:
+            bands = [Band(number, 0, len(level)) for number, (level, _) in enumerate(levels)]
+        count = level_count((grey.shape[1], grey.shape[0]))
+        most = quotas(count, self._settings.max_features)
         parts = []
-        for (level, full_from_level), quota in zip(levels[chosen], quotas[chosen], strict=True):
-            found = self._describe_corners(level, _resized_mask(mask, level), quota)
+        for band in bands:
+            level, full_from_level = levels[band.level]
+            first = max(0, band.first_row - _BAND_MARGIN_PX)
+            rows = level[first : band.end_row + _BAND_MARGIN_PX]
+            shown = None if mask is None else _resized_mask(mask, level)
+            quota = round(most[band.level] * len(rows) / len(level))
+            found = self._describe_corners(rows, shown, max(1, quota))
             factor = np.float32(full_from_level[0, 0])
             parts.append(
                 Features(
-                    transform_points(full_from_level, found.points),
+                    transform_points(
+                        full_from_level, found.points + np.array([0, first], np.float32)
+                    ),
                     found.sizes * factor,
                     found.responses,
                     found.descriptors,
@@ -207,26 +218,6 @@ def _concatenated(parts: Sequence[Features]) -> Features:
 def _points_of(keypoints: Sequence[cv2.KeyPoint]) -> Points:
     points: Points = np.asarray(cv2.KeyPoint.convert(keypoints), np.float32).reshape(-1, 2)
     return points
-
-
-def _pyramid(grey: Image) -> list[tuple[Image, npt.NDArray[np.float64]]]:
-    """(level picture, full_from_level), each level smaller by `PYRAMID_STEP`."""
-    height, width = grey.shape
-    levels = [(grey, np.eye(3))]
-    while True:
-        factor = PYRAMID_STEP ** -len(levels)
-        size = round(width * factor), round(height * factor)
-        if min(size) < _MIN_LEVEL_PX or len(levels) == 6:
-            return levels
-        source = levels[-2][0] if len(levels) >= 2 else grey
-        level = np.asarray(cv2.resize(source, size, interpolation=cv2.INTER_AREA), np.uint8)
-        levels.append((level, scaling(width / size[0], height / size[1])))
-
-
-def _quotas(levels: int, total: int) -> list[int]:
-    """Keypoints a level may keep: falling by the pyramid step, `total` in sum."""
-    shares = PYRAMID_STEP ** -np.arange(levels, dtype=np.float64)
-    return [max(1, round(total * share)) for share in shares / shares.sum()]
 
 
 def _resized_mask(mask: Image | None, level: Image) -> Image | None:

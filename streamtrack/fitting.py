@@ -167,54 +167,68 @@ def gauss_newton_step(start: Matrix, a: Doubles, b: Doubles, weights: Doubles) -
 
     The DLT minimises an algebraic error, this the geometric one (Hartley & Zisserman, section
     4.2.3). A pair's Jacobian (equation 4.21) is [ray 0 -u ray_xy; 0 ray -v ray_xy] with
-    ray = (x, y, 1) / depth, so the normal equations are summed block by block. Parameters are
-    scaled to a unit diagonal for conditioning.
+    ray = (x, y, 1) / depth. Every product that the normal equations need stands in one Gram
+    matrix of ray, -u ray_xy, -v ray_xy and the residuals. Parameters are scaled to a unit
+    diagonal for conditioning.
     """
-    homogeneous, residual = _residuals(start, a, b)
+    start = start / start[2, 2]
+    depth, residual = _residuals(start, a, b)
+    minus_u, minus_v = residual - b.T
+    gram = np.empty((9, len(a)))
+    ray = gram[0:3]
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse_depth = (start[2, 2] / homogeneous[:, 2])[:, None]
-        u, v = (homogeneous[:, :2] / homogeneous[:, 2:]).T
-    ray = np.concatenate([a * inverse_depth, inverse_depth], axis=1)
-    weighted = ray * weights[:, None]
-    by_depth = np.concatenate([-u[:, None] * ray[:, :2], -v[:, None] * ray[:, :2]])
-    weighted_by_depth = by_depth * np.concatenate([weights, weights])[:, None]
-    count = len(a)
-    normal, gradient = np.zeros((8, 8)), np.zeros(8)
-    normal[0:3, 0:3] = normal[3:6, 3:6] = weighted.T @ ray
-    normal[0:3, 6:8] = weighted.T @ by_depth[:count]
-    normal[3:6, 6:8] = weighted.T @ by_depth[count:]
+        np.divide(1.0, depth, out=ray[2])
+        np.multiply(a.T, ray[2], out=ray[:2])
+        np.multiply(ray[:2], minus_u, out=gram[3:5])
+        np.multiply(ray[:2], minus_v, out=gram[5:7])
+    gram[7:9] = residual
+    products = (gram * weights) @ gram.T
+    normal = np.zeros((8, 8))
+    normal[0:3, 0:3] = normal[3:6, 3:6] = products[0:3, 0:3]
+    normal[0:3, 6:8] = products[0:3, 3:5]
+    normal[3:6, 6:8] = products[0:3, 5:7]
     normal[6:8, 0:6] = normal[0:6, 6:8].T
-    normal[6:8, 6:8] = weighted_by_depth.T @ by_depth
-    gradient[0:6] = (weighted.T @ residual).T.ravel()
-    gradient[6:8] = weighted_by_depth.T @ residual.T.ravel()
-    length = np.sqrt(np.diagonal(normal)) + 1e-300
+    normal[6:8, 6:8] = products[3:5, 3:5] + products[5:7, 5:7]
+    gradient = np.concatenate(
+        [products[0:3, 7], products[0:3, 8], products[3:5, 7] + products[5:7, 8]]
+    )
+    length = np.sqrt(normal.diagonal()) + 1e-300
     normal /= length[:, None] * length
     normal[np.diag_indices(8)] *= 1 + 1e-9
     try:
         change = np.linalg.solve(normal, gradient / length) / length
     except np.linalg.LinAlgError:
         return start
-    moved = start / start[2, 2] + np.append(change, 0.0).reshape(3, 3)
+    moved = start + np.append(change, 0.0).reshape(3, 3)
     return moved if np.all(np.isfinite(moved)) else start
 
 
-def _residuals(b_from_a: Matrix, a: Doubles, b: Doubles) -> tuple[Doubles, Doubles]:
-    homogeneous = a @ b_from_a[:, :2].T + b_from_a[:, 2]
+def _residuals(b_from_a: Matrix, a: Points | Doubles, b: Points | Doubles) -> tuple[Doubles, ...]:
+    """Depths (M,) of the points of a seen from b, and what b has beyond their places (2, M)."""
+    (p, q, r), (s, t, u), (v, w, z) = b_from_a.tolist()
+    x, y = np.array(a.T, np.float64, order="C")
+    depth = v * x + w * y + z
+    residual = np.empty((2, len(a)))
     with np.errstate(divide="ignore", invalid="ignore"):
-        mapped = homogeneous[:, :2] / homogeneous[:, 2:]
-    return homogeneous, b - mapped
+        np.subtract(b[:, 0], (p * x + q * y + r) / depth, out=residual[0])
+        np.subtract(b[:, 1], (s * x + t * y + u) / depth, out=residual[1])
+    return depth, residual
 
 
 def transfer_errors(b_from_a: Matrix, a: Points, b: Points) -> Doubles:
     """Distance (M,) in b between each mapped point of a and its partner; inf at the horizon."""
-    _, residual = _residuals(b_from_a, a.astype(np.float64), b.astype(np.float64))
-    distances = np.hypot(residual[:, 0], residual[:, 1])
+    _, residual = _residuals(b_from_a, a, b)
+    distances: Doubles = np.hypot(residual[0], residual[1])
     distances[np.isnan(distances)] = np.inf
     return distances
 
 
-def fit_best_model(a: Points, b: Points, ladder: Sequence[Model]) -> tuple[Model, Matrix]:
+def fit_best_model(
+    a: Points, b: Points, ladder: Sequence[Model], near: Matrix | None = None
+) -> tuple[Model, Matrix]:
     """The model of a ladder, poorest first, with the least GRIC, and its fit to the pairs.
+
+    ``near``, if given, is a homography about right, from which the best one is reached in a step.
 
     Geometric Robust Information Criterion (Torr 1998, "Geometric motion segmentation and model
     selection"): sum of min(e^2 / s^2, 2 (r - d)) + l1 d n + l2 k with r = 4 coordinates a pair,
@@ -222,7 +236,7 @@ def fit_best_model(a: Points, b: Points, ladder: Sequence[Model]) -> tuple[Model
     models, so left out) and l2 = ln(r n). The noise s is that of the richest model's residuals,
     at least `_MIN_NOISE_PX`. It asks of each further freedom that it pays in residuals.
     """
-    fits = {model: fit(model, a, b) for model in ladder}
+    fits = {model: _fit_near(model, a, b, near) for model in ladder}
     if len(ladder) == 1:
         return ladder[0], fits[ladder[0]]
     residuals = {model: transfer_errors(fits[model], a, b) for model in ladder}
@@ -235,6 +249,13 @@ def fit_best_model(a: Points, b: Points, ladder: Sequence[Model]) -> tuple[Model
 
     best = min(ladder, key=gric)
     return best, fits[best]
+
+
+def _fit_near(model: Model, a: Points, b: Points, near: Matrix | None) -> Matrix:
+    if model is not Model.HOMOGRAPHY or near is None:
+        return fit(model, a, b)
+    pairs = a.astype(np.float64), b.astype(np.float64)
+    return gauss_newton_step(near, *pairs, np.ones(len(a)))
 
 
 def poorest_model(b_from_a: Matrix, region: Points) -> Model:

@@ -18,6 +18,7 @@ from streamtrack import geometry
 from streamtrack.blur import motion_blur, with_best_length
 from streamtrack.fitting import fit, gauss_newton_step, poorest_model, transfer_errors
 from streamtrack.frame_view import FrameView
+from streamtrack.likeness import local_correlation, matched_in_grey, moved_by
 from streamtrack.refine import Prior, refined
 from streamtrack.registration import Effort, judge_mapping, refused, register
 from streamtrack.settings import RegistrationSettings
@@ -29,10 +30,9 @@ Floats = npt.NDArray[np.float32]
 _MIN_CORRELATION = 0.5  # of a point's window, below which the point is no evidence
 _MIN_SUPPORTED_SHARE = 0.12  # of the points in view that must agree with the pose
 _MIN_VISIBLE_POINTS = 10
-_CORRELATION_WINDOW = 11  # patch pixels
-_NOISE_VARIANCE = 9.0  # grey levels squared
 _SEARCH_PX = 12.0  # how far, in patch pixels, a flow may reach: the area for chance agreement
 _INLIER_PX = 1.5  # patch pixels
+_SMEARING_PX = 8.0  # motion in a frame: less is hardly smeared
 _COARSE_STEPS = 2  # patches between the fine and the coarse alignment: half the resolution
 _CLEAR = 0.8  # share of the points in view that agree
 _POINT_SIGMA_PX = 0.5  # patch pixels
@@ -71,6 +71,18 @@ class _Warp:
     visible: Mask
 
 
+@dataclass(frozen=True, slots=True)
+class Hope:
+    """What to expect of a guess that should be good.
+
+    share      of the points in view that then agree
+    motion_px  how far the target moves in a frame, which may smear it
+    """
+
+    share: float
+    motion_px: float
+
+
 class FlowAligner:
     """Aligns one template; keeps DIS's buffers from frame to frame, nothing else."""
 
@@ -81,38 +93,49 @@ class FlowAligner:
         self._coarse_flow = _make_flow()
         self._fine_flow = _make_flow()
 
-    def align(
-        self,
-        view: FrameView,
-        guess: Matrix,
-        sigma_px: float | None = None,
-        is_calm: bool = False,
-    ) -> Alignment:
+    def align(self, view: FrameView, guess: Matrix, sigma_px: float | None = None) -> Alignment:
         """The pose near ``guess`` (frame_from_template): first coarse, then fine, then refined.
 
         ``sigma_px`` says how far from the guess the corners usually turn out to be, if known.
-        ``is_calm`` says that the guess is good and nothing moves fast enough to be smeared: the
-        coarse alignment is then left out as long as the fine one finds the target clearly.
         """
-        template = self._template
-        coarsest = len(template.patches) - 1
-        fine = min(patch_for(template, guess) + view.work.patch_steps, coarsest)
-        coarse = min(fine + _COARSE_STEPS, coarsest)
-        pose, patch = guess, template.patches[fine]
-        prior = None if sigma_px is None else Prior(guess, template.quad, sigma_px)
-        if is_calm:
-            found = self._flow_step(view, patch, pose, self._fine_flow, _QUICK, prior)
-            if _is_clear(found):
-                return self._refined(view, patch, found, prior)
-        if coarse > fine:
-            rough, smear = self._roughly(view, template.patches[coarse], guess, prior)
+        fine, coarse = self._patches_for(view, guess)
+        prior = None if sigma_px is None else Prior(guess, self._template.quad, sigma_px)
+        pose = guess
+        if coarse is not fine:
+            rough, smear = self._roughly(view, coarse, guess, prior)
             if rough.registration.b_from_a is None:
                 return rough
             pose = rough.registration.b_from_a
             if smear.any():
-                patch = patch.smeared(smear * (patch.scale / template.patches[coarse].scale))
-        found = self._flow_step(view, patch, pose, self._fine_flow, _QUICK, prior)
-        return self._refined(view, patch, found, prior)
+                fine = fine.smeared(smear * (fine.scale / coarse.scale))
+        found = self._flow_step(view, fine, pose, self._fine_flow, _QUICK, prior)
+        return self._refined(view, fine, found, prior)
+
+    def align_near(
+        self, view: FrameView, guess: Matrix, hope: Hope, sigma_px: float | None = None
+    ) -> Alignment:
+        """The same from a guess that should be good, at half the cost: fine at once.
+
+        Refused unless as much of the target agrees as was hoped for.
+        """
+        fine, coarse = self._patches_for(view, guess)
+        prior = None if sigma_px is None else Prior(guess, self._template.quad, sigma_px)
+        found = self._flow_step(view, fine, guess, self._fine_flow, _QUICK, prior)
+        if found.registration.b_from_a is None:
+            return found
+        if agreeing_share(found) < hope.share:
+            is_inlier = found.registration.is_inlier
+            unlike = refused(Verdict.LOW_CORRELATION, len(is_inlier), is_inlier)
+            return replace(found, registration=unlike)
+        if hope.motion_px > _SMEARING_PX:
+            fine = _smeared_alike(view, fine, coarse, found)
+        return self._refined(view, fine, found, prior)
+
+    def _patches_for(self, view: FrameView, guess: Matrix) -> tuple[Patch, Patch]:
+        """The fine and the coarse patch; there may be none that is coarser."""
+        patches = self._template.patches
+        fine = min(patch_for(self._template, guess) + view.work.patch_steps, len(patches) - 1)
+        return patches[fine], patches[min(fine + _COARSE_STEPS, len(patches) - 1)]
 
     def _roughly(
         self, view: FrameView, patch: Patch, guess: Matrix, prior: Prior | None
@@ -181,13 +204,13 @@ class FlowAligner:
         template_points = patch.template_points[visible]
         if np.count_nonzero(visible) < _MIN_VISIBLE_POINTS:
             return _refusal(Verdict.OUT_OF_VIEW, visible, template_points)
-        image = _matched_in_grey(warp.image, patch, visible)
+        image = matched_in_grey(warp.image, patch, visible)
         start = np.zeros((*image.shape, 2), np.float32)
         field = np.asarray(flow.calc(patch.image, image, start), np.float32)
         columns, rows = patch.points[visible].astype(np.intp).T
         moved = patch.points[visible] + field[rows, columns]
         frame_points = geometry.transform_points(warp.frame_from_patch, moved)
-        correlation = _local_correlation(patch.image, _warped_by(image, field))[rows, columns]
+        correlation = local_correlation(patch, moved_by(image, field), rows, columns)
         is_like = correlation >= _MIN_CORRELATION
         registration = self._estimate(patch, warp, moved, is_like, effort, prior)
         supported = registration.is_inlier
@@ -219,7 +242,8 @@ class FlowAligner:
             (2 * _SEARCH_PX) ** 2,
             effort,
         )
-        if settings.model == "auto" and _looks_bent(is_like, found):
+        # Not for a target that comes back: what agrees so loosely would be thin evidence.
+        if settings.model == "auto" and prior is not None and _looks_bent(is_like, found):
             loose = {"inlier_threshold_px": _BENT_INLIER_PX, "model": Model.SIMILARITY.value}
             found = register(
                 patch.points[warp.visible][is_like],
@@ -279,9 +303,12 @@ def _held_by(
     return mapping
 
 
-def _is_clear(found: Alignment) -> bool:
-    registration = found.registration
-    return registration.verdict is Verdict.OK and float(np.mean(registration.is_inlier)) > _CLEAR
+def agreeing_share(alignment: Alignment) -> float:
+    """Share (0..1) of the points in view that agree with the pose; 0 if it was refused."""
+    found = alignment.registration
+    if found.b_from_a is None or not len(found.is_inlier):
+        return 0.0
+    return float(np.mean(found.is_inlier))
 
 
 def _near(patch: Patch, rows: Mask) -> Mask:
@@ -329,51 +356,13 @@ def _warp_back(view: FrameView, patch: Patch, pose: Matrix) -> _Warp:
     return _Warp(image, frame_from_patch, frame_px, visible)
 
 
-def _matched_in_grey(image: Image, patch: Patch, visible: Mask) -> Image:
-    """The warped frame with its contrast and brightness brought to the patch's.
-
-    Fitted robustly (median and quartiles) at the visible points, so that an occluder of less
-    than half the target does not set them. DIS itself removes the mean of each small block.
-    """
-    columns, rows = patch.points[visible].astype(np.intp).T
-    ours, theirs = np.sort(patch.image[rows, columns]), np.sort(image[rows, columns])
-    low, middle, high = (int(share * len(ours)) for share in (0.2, 0.5, 0.8))
-    ours_range, theirs_range = (int(v[high]) - int(v[low]) + 2 for v in (ours, theirs))
-    gain = min(4.0, max(0.3, ours_range / theirs_range))
-    shift = float(ours[middle]) - gain * float(theirs[middle])
-    adjusted = cv2.convertScaleAbs(image, alpha=gain, beta=shift)
-    return np.asarray(adjusted, np.uint8)
-
-
-def _warped_by(image: Image, field: Floats) -> Image:
-    """``image`` sampled at each pixel's place plus its flow (h, w, 2)."""
-    height, width = image.shape
-    columns, rows = np.meshgrid(
-        np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)
-    )
-    warped = cv2.remap(
-        image,
-        columns + field[..., 0],
-        rows + field[..., 1],
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
-    return np.asarray(warped, np.uint8)
-
-
-def _local_correlation(a: Image, b: Image) -> Floats:
-    """Normalised cross-correlation of the windows around each pixel, (h, w) in -1..1.
-
-    The variance of plain noise is added to the denominator, so flat windows score zero.
-    """
-    window = (_CORRELATION_WINDOW, _CORRELATION_WINDOW)
-    mean_a, mean_b = (cv2.boxFilter(image, cv2.CV_32F, window) for image in (a, b))
-    square_a, square_b = (cv2.sqrBoxFilter(image, cv2.CV_32F, window) for image in (a, b))
-    product = cv2.multiply(a, b, dtype=cv2.CV_32F)
-    covariance = cv2.boxFilter(product, -1, window) - mean_a * mean_b
-    variance_a = square_a - mean_a * mean_a + _NOISE_VARIANCE
-    variance_b = square_b - mean_b * mean_b + _NOISE_VARIANCE
-    return np.asarray(covariance / np.sqrt(variance_a * variance_b), np.float32)
+def _smeared_alike(view: FrameView, patch: Patch, coarse: Patch, found: Alignment) -> Patch:
+    """The patch under the motion blur under which it was found, judged at lower resolution."""
+    pose = found.registration.b_from_a
+    assert pose is not None
+    seen = _warp_back(view, coarse, pose)
+    smear = motion_blur(coarse.image, seen.image, _near(coarse, seen.visible))
+    return patch.smeared(smear * (patch.scale / coarse.scale)) if smear.any() else patch
 
 
 def _refusal(verdict: Verdict, in_view: Mask, template_points: Points) -> Alignment:

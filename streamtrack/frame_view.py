@@ -22,7 +22,7 @@ class FrameView:
         self._extractor = extractor
         self.pyramid = Pyramid(geometry.grey_of(frame.image))
         self._features: Features | None = None
-        self._halves: dict[int, Features] = {}
+        self._parts: dict[int, Features] = {}
         self.detect_ms = 0.0
 
     @property
@@ -42,19 +42,19 @@ class FrameView:
             self.detect_ms += (time.perf_counter() - start) * 1e3
         return self._features
 
-    def half_of_features(self, half: int) -> Features:
-        """Even or odd ``half`` of the frame's features; all if they are known already."""
+    def part_of_features(self, part: int) -> Features:
+        """A part of the frame's features, in turns of ``part``; all if they are known already."""
         if self._features is not None:
             return self._features
-        if half % 2 not in self._halves:
+        if part not in self._parts:
             start = time.perf_counter()
-            self._halves[half % 2] = self._extractor.extract_half(self.grey, half)
+            self._parts[part] = self._extractor.extract_part(self.grey, part)
             self.detect_ms += (time.perf_counter() - start) * 1e3
-        return self._halves[half % 2]
+        return self._parts[part]
 
     @property
     def detected(self) -> Features | None:
         """The features that any stage asked for, else None."""
-        if self._features is not None or not self._halves:
+        if self._features is not None or not self._parts:
             return self._features
-        return max(self._halves.values(), key=len)
+        return max(self._parts.values(), key=len)

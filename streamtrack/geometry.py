@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from math import inf, isfinite, sqrt
+from math import copysign, inf, isfinite, nan, sqrt
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from streamtrack.types import Image, Matrix, Points, Size
+
+_FEW = 8
+_LARGEST = float(np.finfo(np.float32).max)
 
 
 def transform_points(b_from_a: Matrix, points: npt.ArrayLike) -> Points:
@@ -15,11 +19,34 @@ def transform_points(b_from_a: Matrix, points: npt.ArrayLike) -> Points:
 
     Points on the horizon come out as inf or NaN; `registration.judge_mapping` refuses those.
     """
-    pts = np.asarray(points, np.float64).reshape(-1, 2)
-    mapped = pts @ b_from_a[:, :2].T + b_from_a[:, 2]
+    pts = np.asarray(points).reshape(-1, 2)
+    if len(pts) <= _FEW:
+        return _few_transformed(b_from_a, pts)
+    (a, b, c), (d, e, f), (g, h, i) = b_from_a.tolist()
+    x, y = np.ascontiguousarray(pts.T, np.float64)
+    result: Points = np.empty((len(pts), 2), np.float32)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        result: Points = (mapped[:, :2] / mapped[:, 2:]).astype(np.float32)
+        depth = g * x + h * y + i
+        result[:, 0] = (a * x + b * y + c) / depth
+        result[:, 1] = (d * x + e * y + f) / depth
     return result
+
+
+def _few_transformed(b_from_a: Matrix, points: npt.NDArray[Any]) -> Points:
+    """The same without numpy's overhead, which for the corners of a quad is nearly all there is."""
+    (a, b, c), (d, e, f), (g, h, i) = b_from_a.tolist()
+    mapped = []
+    for x, y in points.tolist():
+        depth = g * x + h * y + i
+        u, v = a * x + b * y + c, d * x + e * y + f
+        mapped.append((_ratio(u, depth), _ratio(v, depth)))
+    return np.array(mapped, np.float32).reshape(-1, 2)
+
+
+def _ratio(a: float, b: float) -> float:
+    """a / b as numpy's float32 has it: infinite where too large, NaN for 0 / 0."""
+    ratio = a / b if b else (a * inf if a else nan)
+    return ratio if abs(ratio) < _LARGEST or ratio != ratio else copysign(inf, ratio)
 
 
 def projective_depths(b_from_a: Matrix, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
@@ -95,9 +122,15 @@ def image_quad(size_wh: Size) -> Points:
     return box_quad(0, 0, size_wh[0] - 1, size_wh[1] - 1)
 
 
+def _corner_list(quad: npt.ArrayLike) -> list[Any]:
+    if isinstance(quad, list):
+        return quad
+    return list(np.asarray(quad, np.float64).reshape(-1, 2).tolist())
+
+
 def signed_area(quad: npt.ArrayLike) -> float:
     """Area of a polygon (N, 2) in px^2; positive when clockwise on the screen (y down)."""
-    corners = np.asarray(quad, np.float64).reshape(-1, 2).tolist()
+    corners = _corner_list(quad)
     doubled = 0.0
     for (x, y), (next_x, next_y) in zip(corners, corners[1:] + corners[:1], strict=True):
         doubled += x * next_y - y * next_x
@@ -106,7 +139,7 @@ def signed_area(quad: npt.ArrayLike) -> float:
 
 def is_convex(quad: npt.ArrayLike) -> bool:
     """True if the polygon (N, 2) is strictly convex, whichever way round."""
-    corners = np.asarray(quad, np.float64).reshape(-1, 2).tolist()
+    corners = _corner_list(quad)
     turns = [
         (bx - ax) * (cy - by) - (by - ay) * (cx - bx)
         for (ax, ay), (bx, by), (cx, cy) in zip(

@@ -9,7 +9,7 @@ here as a refusal.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import lgamma, log
+from math import isfinite, lgamma, log
 
 import cv2
 import numpy as np
@@ -62,11 +62,11 @@ def register(
         return replace(found, is_inlier=is_inlier)
     if len(a) < max(4, settings.min_inliers):
         return refused(Verdict.TOO_FEW_MATCHES, len(a))
-    is_inlier = robust_inliers(a, b, settings)
+    near, is_inlier = _robust_estimate(a, b, settings)
     if np.count_nonzero(is_inlier) < settings.min_inliers:
         return refused(Verdict.TOO_FEW_INLIERS, len(a), is_inlier)
     ladder = effort.ladder if settings.model == "auto" else (Model(settings.model),)
-    model, start = fit_best_model(a[is_inlier], b[is_inlier], ladder)
+    model, start = fit_best_model(a[is_inlier], b[is_inlier], ladder, near)
     b_from_a, is_inlier = fit_robustly(
         model, start, a, b, settings.inlier_threshold_px, effort.robust_rounds
     )
@@ -95,11 +95,20 @@ def robust_inliers(a: Points, b: Points, settings: RegistrationSettings) -> Mask
 
     MAGSAC++ (Barath et al. 2020) as in OpenCV's USAC, with the seed of the settings.
     """
+    return _robust_estimate(a, b, settings)[1]
+
+
+def _robust_estimate(
+    a: Points, b: Points, settings: RegistrationSettings
+) -> tuple[Matrix | None, Mask]:
+    """The homography, unless fewer freedoms were asked for, and which pairs (M,) agree."""
     if settings.model in ("translation", "similarity", "affine"):
         _, mask = cv2.estimateAffine2D(a, b, _usac(settings))
-    else:
-        _, mask = cv2.findHomography(a, b, _usac(settings))
-    return _as_mask(mask, len(a))
+        return None, _as_mask(mask, len(a))
+    near, mask = cv2.findHomography(a, b, _usac(settings))
+    # OpenCV's stubs say that there is always a matrix.
+    is_usable = near is not None and bool(np.isfinite(near).all()) and near[2, 2] != 0
+    return np.asarray(near, np.float64) if is_usable else None, _as_mask(mask, len(a))
 
 
 def _usac(settings: RegistrationSettings) -> cv2.UsacParams:
@@ -174,21 +183,27 @@ def judge_mapping(b_from_a: Matrix, region: Points) -> Verdict:
     areas that change more than 60-fold, and perspective under which one corner is magnified
     15 times as much as another.
     """
-    if not np.all(np.isfinite(b_from_a)):
+    # In plain numbers: for four corners numpy would be ten times as slow.
+    (a, b, c), (d, e, f), (g, h, i) = b_from_a.tolist()
+    if not isfinite(a + b + c + d + e + f + g + h + i):
         return Verdict.MIRRORED
-    depths = geometry.projective_depths(b_from_a, region)
-    if not (np.all(depths > 0) or np.all(depths < 0)):
+    corners = region.tolist()
+    depths = [g * x + h * y + i for x, y in corners]
+    if not (min(depths) > 0 or max(depths) < 0):
         return Verdict.MIRRORED
-    quad = geometry.transform_points(b_from_a, region)
-    area, area_before = geometry.signed_area(quad), geometry.signed_area(region)
-    if not np.all(np.isfinite(quad)) or area * area_before <= 0:
+    quad = [
+        ((a * x + b * y + c) / depth, (d * x + e * y + f) / depth)
+        for (x, y), depth in zip(corners, depths, strict=True)
+    ]
+    area, area_before = geometry.signed_area(quad), geometry.signed_area(corners)
+    if not isfinite(area) or area * area_before <= 0:
         return Verdict.MIRRORED
     if not geometry.is_convex(quad):
         return Verdict.NOT_CONVEX
     if not 1 / _MAX_AREA_RATIO <= area / area_before <= _MAX_AREA_RATIO:
         return Verdict.AREA
     # The local area magnification of a homography is |det H| / depth^3.
-    magnification = np.abs(depths) ** -3
-    if magnification.max() > _MAX_PERSPECTIVE_RATIO * magnification.min():
+    sizes = [abs(depth) for depth in depths]
+    if (max(sizes) / min(sizes)) ** 3 > _MAX_PERSPECTIVE_RATIO:
         return Verdict.PERSPECTIVE
     return Verdict.OK

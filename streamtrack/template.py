@@ -18,6 +18,8 @@ from streamtrack.types import Features, Image, Mask, Matrix, Points, Size
 
 PATCH_AREA_PX = 36_000
 """Area of the finest patch: more costs time and gains no accuracy."""
+CORRELATION_WINDOW = 11
+"""Patch pixels."""
 _MAX_ENLARGEMENT = 2.0
 _SCALE_STEP = 2**-0.5
 _MIN_PATCH_SIDE_PX = 28
@@ -33,6 +35,14 @@ _SURROUNDINGS_SHARE = 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Windows:
+    """Mean and variance of the grey values around each pixel, float32 (h, w)."""
+
+    mean: npt.NDArray[np.float32]
+    variance: npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Patch:
     """The target at one scale.
 
@@ -43,6 +53,8 @@ class Patch:
     template_points      the same places in template pixels
     gradients            the pixels on which a pose is refined
     nearest_point        int (gradient pixels,), row of the point nearest to each of them
+    windows              what the image's correlation with another needs of it
+    template_from_patch  the inverse of patch_from_template
     """
 
     image: Image
@@ -52,6 +64,8 @@ class Patch:
     template_points: Points
     gradients: Gradients
     nearest_point: npt.NDArray[np.intp]
+    windows: Windows
+    template_from_patch: Matrix
 
     @property
     def size_wh(self) -> Size:
@@ -60,11 +74,8 @@ class Patch:
     def smeared(self, vector: npt.NDArray[np.float64]) -> Patch:
         """The patch under a motion blur ``vector`` (2,), in patch pixels."""
         image = smeared_along(self.image, vector)
-        return replace(self, image=image, gradients=changed_gradients(self.gradients, image))
-
-    @property
-    def template_from_patch(self) -> Matrix:
-        return geometry.inverted(self.patch_from_template)
+        gradients = changed_gradients(self.gradients, image)
+        return replace(self, image=image, gradients=gradients, windows=_windows(image))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +136,8 @@ def _make_patch(
     size: tuple[int, int],
 ) -> Patch:
     patch_from_template = geometry.scaling(scale) @ geometry.translation(-corner[0], -corner[1])
-    image = pyramid.warped(geometry.inverted(patch_from_template), size)
+    template_from_patch = geometry.inverted(patch_from_template)
+    image = pyramid.warped(template_from_patch, size)
     inside = _polygon_mask(geometry.transform_points(patch_from_template, quad), size)
     if shown is not None:
         inside &= _surroundings(geometry.transform_points(patch_from_template, shown), size)
@@ -135,10 +147,25 @@ def _make_patch(
     points = _textured_points(image, interior)
     if len(points) < _FEW_POINTS:
         points = _textured_points(image, inside)
-    template_points = geometry.transform_points(geometry.inverted(patch_from_template), points)
     gradients = make_gradients(image, inside)
-    nearest = _nearest_rows(points, gradients.index, size)
-    return Patch(image, patch_from_template, scale, points, template_points, gradients, nearest)
+    return Patch(
+        image,
+        patch_from_template,
+        scale,
+        points,
+        geometry.transform_points(template_from_patch, points),
+        gradients,
+        _nearest_rows(points, gradients.index, size),
+        _windows(image),
+        template_from_patch,
+    )
+
+
+def _windows(image: Image) -> Windows:
+    window = (CORRELATION_WINDOW, CORRELATION_WINDOW)
+    mean = np.asarray(cv2.boxFilter(image, cv2.CV_32F, window), np.float32)
+    square = np.asarray(cv2.sqrBoxFilter(image, cv2.CV_32F, window), np.float32)
+    return Windows(mean, square - mean * mean)
 
 
 def _nearest_rows(points: Points, index: npt.NDArray[np.intp], size: Size) -> npt.NDArray[np.intp]:

@@ -21,7 +21,8 @@ from streamtrack.appearance import (
     chroma_distance,
 )
 from streamtrack.fitting import fit
-from streamtrack.flow import Alignment, FlowAligner
+from streamtrack.flatness import Flatness
+from streamtrack.flow import Alignment, FlowAligner, Hope, agreeing_share
 from streamtrack.frame_view import FrameView
 from streamtrack.matching import match, match_guided
 from streamtrack.registration import refused, register
@@ -39,19 +40,21 @@ from streamtrack.types import (
     TrackState,
     Verdict,
 )
-from streamtrack.views import RecentViews, agreeing_share
+from streamtrack.views import RecentViews
 
 _GUIDED_RADIUS_PX = 60.0
 _COAST_FRAMES = 10  # lost frames in which the last pose is still tried
 _MAX_AREA_JUMP = 1.5  # from the prediction to what is found
 _MIN_RETURN_SHARE = 0.3  # of the points in view, for a target that was lost
-_FULL_SEARCH_EVERY = 12  # lost frames; between them half of the features are searched
 _FIRST_SURPRISE_PX = 5.0
 _MIN_SURPRISE_PX = 2.0
 _THIN_SHARE = 0.33  # inliers of all points, below which hidden corners go by prediction
 _MAX_DOUBT_PX = 8.0  # how far off hidden corners may be thought to be
-_CALM_SURPRISE_PX = 2.5
-_CALM_MOTION_PX = 8.0  # a frame: less is hardly smeared
+_CALM_SURPRISE_PX = 3.0  # of a guess that is tried at once
+_CALM_SURPRISE_FLAT_PX = 4.5
+_HOPED_SHARE = 0.8  # of the points in view that agree if the guess was good
+_LEAST_HOPED_SHARE = 0.35
+_SHARE_KEPT = 0.85  # of the last frame's, where less agree of what is flat: an occluder stays
 _SURPRISE_RATE = 0.2  # share of a new frame's surprise in the running mean
 _CLEAR_VIEW_SHARE = 0.5  # inliers of all points, below which a frame teaches no surprise
 _MIN_VIEW_SHARE = 0.6  # of the points of a recent view
@@ -106,6 +109,7 @@ class HybridTracker:
         self._aligner = FlowAligner(template, settings.registration)
         self._views = RecentViews(template, settings.registration)
         self._is_in_view = False
+        self._flatness = Flatness(template.quad)
         self._frames_to_next_view = 0
         self._uses_views = settings.registration.model == "auto"
         self._pose = first_pose
@@ -114,6 +118,7 @@ class HybridTracker:
         self._searches = 0
         self._surprise_px = _FIRST_SURPRISE_PX
         self._doubt_px = 0.0
+        self._last_share = 0.0
         self._was_seen = first_pose is not None
         is_same_camera = first_pose is not None
         self._max_chroma_distance = (
@@ -125,8 +130,9 @@ class HybridTracker:
         recent = self._follow_views(view, followed)
         if recent is not None:
             return self._tracked(recent, "view")
-        if followed is not None and followed.registration.verdict is Verdict.OK:
-            if agreeing_share(followed) >= _CLEAR_VIEW_SHARE:
+        if followed is not None and followed.registration.b_from_a is not None:
+            self._flatness.learn(followed.registration.b_from_a, agreeing_share(followed))
+            if self._flatness.is_proven or agreeing_share(followed) >= _CLEAR_VIEW_SHARE:
                 self._views.remember(view, followed)
             return self._tracked(followed, "flow")
         self._views.forget()
@@ -172,9 +178,7 @@ class HybridTracker:
         if self._pose is None or not self._coasts():
             return None
         guess = self._pose if self._step_pose is None else self._step_pose @ self._pose
-        sigma_px = self._surprise_px if self._frames_lost == 0 else None
-        alignment = self._aligner.align(view, guess, sigma_px, self._is_calm(guess))
-        followed = self._plausible(alignment, guess)
+        followed = self._plausible(self._align_first(view, guess), guess)
         found = followed.registration
         if found.b_from_a is not None and self._frames_lost == 0:
             share = np.count_nonzero(found.is_inlier) / len(followed.is_in_view)
@@ -187,6 +191,22 @@ class HybridTracker:
                     followed = _refused(followed, Verdict.MOSTLY_HIDDEN)
         return followed if self._frames_lost == 0 else self._with_own_colors(followed, view)
 
+    def _align_first(self, view: FrameView, guess: Matrix) -> Alignment:
+        """The first view in the frame: near the guess if that should be good, else farther off.
+
+        While a recent view carries a flat target, the first is only tried for its return.
+        """
+        if self._frames_lost:
+            return self._aligner.align(view, guess)
+        hope = self._hope(guess)
+        if hope is not None:
+            near = self._aligner.align_near(view, guess, hope, self._surprise_px)
+            if near.registration.b_from_a is not None or (
+                self._is_in_view and self._flatness.is_proven
+            ):
+                return near
+        return self._aligner.align(view, guess, self._surprise_px)
+
     def _follow_views(self, view: FrameView, followed: Alignment | None) -> Alignment | None:
         """The pose by how the target looked lately, where the first view does not explain it."""
         if not self._uses_views or self._pose is None or self._frames_lost or followed is None:
@@ -196,11 +216,15 @@ class HybridTracker:
             self._is_in_view = False
             self._frames_to_next_view = 0
             return None
+        if self._flatness.is_proven and followed.registration.b_from_a is not None:
+            return None
         if self._frames_to_next_view:
             self._frames_to_next_view -= 1
             return None
         guess = self._pose if self._step_pose is None else self._step_pose @ self._pose
-        recent = self._views.align(view, guess)
+        if self._flatness.is_proven:
+            self._views.take_as_flat()
+        recent = self._views.align(view, guess, self._surprise_px)
         if recent is None:
             return None
         recent = self._with_own_colors(self._plausible(recent, guess), view)
@@ -215,12 +239,15 @@ class HybridTracker:
             self._views.renew()
         return recent
 
-    def _is_calm(self, guess: Matrix) -> bool:
-        """Is the target's motion, by the last frames, slow and well predicted?"""
-        if self._pose is None or self._frames_lost or self._surprise_px > _CALM_SURPRISE_PX:
-            return False
-        moved_px = _rms_distance_px(guess, self._pose, self.template.quad)
-        return moved_px <= _CALM_MOTION_PX
+    def _hope(self, guess: Matrix) -> Hope | None:
+        """What to expect of the guess, if the target was well predicted in the last frames."""
+        most_px = _CALM_SURPRISE_FLAT_PX if self._flatness.is_proven else _CALM_SURPRISE_PX
+        if self._pose is None or self._surprise_px > most_px:
+            return None
+        share = _HOPED_SHARE
+        if self._flatness.is_proven:
+            share = max(_LEAST_HOPED_SHARE, min(share, _SHARE_KEPT * self._last_share))
+        return Hope(share, _rms_distance_px(guess, self._pose, self.template.quad))
 
     def _plausible(self, alignment: Alignment, guess: Matrix) -> Alignment:
         """The alignment, refused if the target jumped in size, or came back on thin evidence."""
@@ -260,29 +287,23 @@ class HybridTracker:
         return alignment if is_like else _refused(alignment, Verdict.OTHER_COLORS)
 
     def _detect(self, view: FrameView) -> tuple[Registration, Evidence, str]:
-        """By features: near the last place in the first lost frame, then everywhere.
+        """By features: near the last place in the first search, then everywhere.
 
-        Once lost, most frames see only half of the features each, so that none takes long.
+        Once seen, a frame shows only a part of its features, so that no search takes long.
         """
+        sees_all = self._searches == 0 and not self._was_seen
+        features = view.features() if sees_all else view.part_of_features(self._searches)
+        self._searches += 1
+        template, matching = self.template.features, self._settings.matching
         if self._pose is not None and self._frames_lost == 0:
-            features = view.features()
-            predicted = geometry.transform_points(self._pose, self.template.features.points)
-            matches = match_guided(
-                self.template.features,
-                features,
-                predicted,
-                _GUIDED_RADIUS_PX,
-                self._settings.matching,
-            )
+            predicted = geometry.transform_points(self._pose, template.points)
+            matches = match_guided(template, features, predicted, _GUIDED_RADIUS_PX, matching)
             found, evidence = _register_features(
                 self.template, view, features, matches, self._settings
             )
             if found.verdict is Verdict.OK:
                 return found, evidence, "guided"
-        sees_all = not self._was_seen or self._frames_lost % _FULL_SEARCH_EVERY == 1
-        self._searches += 1
-        features = view.features() if sees_all else view.half_of_features(self._searches)
-        matches = match(self.template.features, features, self._settings.matching)
+        matches = match(template, features, matching)
         found, evidence = _register_features(self.template, view, features, matches, self._settings)
         return found, evidence, "global"
 
@@ -299,7 +320,8 @@ class HybridTracker:
             share = float(np.mean(found.is_inlier))
             self._surprise_px = max(self._surprise_px, _FIRST_SURPRISE_PX / max(share, 0.1))
         self._pose = found.b_from_a
-        self._frames_lost = 0
+        self._last_share = agreeing_share(alignment) if means != "view" else 0.0
+        self._frames_lost = self._searches = 0
         self._was_seen = True
         evidence = Evidence(alignment.template_points, alignment.frame_points, found.is_inlier)
         return make_track(

@@ -5,21 +5,22 @@ or a running animal stops looking like it, though from one frame to the next it 
 So each frame in which the target was seen clearly is remembered, and when the first view no longer
 explains the target, the frame is aligned with the newest remembered one. Only places that were seen
 to belong to the target are compared, so that an occluder never becomes part of it, and only few
-freedoms are estimated, since a curved surface does not move as a plane.
+freedoms are estimated, since a curved surface does not move as a plane; unless the target was seen
+to be one.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from streamtrack import geometry
-from streamtrack.flow import Alignment, FlowAligner
+from streamtrack.flow import Alignment, FlowAligner, Hope
 from streamtrack.frame_view import FrameView
 from streamtrack.settings import RegistrationSettings
 from streamtrack.template import MIN_FLOW_POINTS, Template, make_patches
 from streamtrack.types import Image, Matrix, Model, Points, Verdict
+
+_HOPE = Hope(0.75, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,6 +40,7 @@ class RecentViews:
 
     def __init__(self, template: Template, settings: RegistrationSettings) -> None:
         self._template = template
+        self._flat_settings = settings
         self._settings = settings.model_copy(update={"model": Model.SIMILARITY.value})
         self._newest: _Sight | None = None
         self._in_use: _Sight | None = None
@@ -55,18 +57,25 @@ class RecentViews:
         """The target was lost: what it looked like then says little about where it is now."""
         self._newest = self._in_use = self._aligner = None
 
-    def align(self, view: FrameView, guess: Matrix) -> Alignment | None:
+    def take_as_flat(self) -> None:
+        """From now on every view is mapped by a homography, as a plane is."""
+        if self._settings is not self._flat_settings:
+            self._settings = self._flat_settings
+            self._in_use = self._aligner = None
+
+    def align(self, view: FrameView, guess: Matrix, sigma_px: float) -> Alignment | None:
         """The pose near ``guess`` by the view in use, else by the newest one; None without any.
 
-        Poses and points are in template pixels, as those of the first view.
+        Poses and points are in template pixels, as those of the first view; ``sigma_px`` is as in
+        `FlowAligner.align`.
         """
-        aligned = self._align_in_use(view, guess)
+        aligned = self._align_in_use(view, guess, sigma_px)
         if aligned is not None and aligned.registration.verdict is Verdict.OK:
             return aligned
         if self._newest is None or self._newest is self._in_use:
             return aligned
         self._use_newest()
-        return self._align_in_use(view, guess)
+        return self._align_in_use(view, guess, sigma_px)
 
     def renew(self) -> None:
         """Compare with the newest sight from now on."""
@@ -84,23 +93,19 @@ class RecentViews:
         seen = replace(self._template, picture=sight.grey, quad=quad, patches=patches)
         self._aligner = FlowAligner(seen, self._settings)
 
-    def _align_in_use(self, view: FrameView, guess: Matrix) -> Alignment | None:
+    def _align_in_use(self, view: FrameView, guess: Matrix, sigma_px: float) -> Alignment | None:
         if self._in_use is None or self._aligner is None:
             return None
         sight_from_template = self._in_use.frame_from_template
         template_from_sight = geometry.inverted(sight_from_template)
-        aligned = self._aligner.align(view, guess @ template_from_sight)
+        is_plane = self._settings is self._flat_settings
+        guess, sigma = guess @ template_from_sight, sigma_px if is_plane else None
+        aligned = self._aligner.align_near(view, guess, _HOPE, sigma)
+        if aligned.registration.b_from_a is None:
+            aligned = self._aligner.align(view, guess, sigma)
         found = aligned.registration
         if found.b_from_a is not None:
             pose = geometry.normalized(found.b_from_a @ sight_from_template)
-            found = replace(found, b_from_a=pose, model=Model.SIMILARITY)
+            found = replace(found, b_from_a=pose)
         points = geometry.transform_points(template_from_sight, aligned.template_points)
         return replace(aligned, registration=found, template_points=points)
-
-
-def agreeing_share(alignment: Alignment) -> float:
-    """Share (0..1) of the points in view that agree with the pose; 0 if it was refused."""
-    found = alignment.registration
-    if found.b_from_a is None or not len(found.is_inlier):
-        return 0.0
-    return float(np.mean(found.is_inlier))

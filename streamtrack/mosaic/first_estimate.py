@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from streamtrack.features import PYRAMID_STEP
+from streamtrack.feature_pyramid import PYRAMID_STEP
 from streamtrack.fitting import fit_best_model, fit_robustly
 from streamtrack.matching import match
 from streamtrack.registration import log10_false_alarms, robust_inliers

@@ -1,0 +1,42 @@
+"""Is a target flat? A plane seen at a slant is still explained by one homography, a body is not.
+
+Turning in the picture plane, coming nearer and moving on prove nothing, as a body's picture does
+the same; so what is asked for is a pose that no similarity comes near.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from streamtrack import geometry
+from streamtrack.fitting import fit, transfer_errors
+from streamtrack.types import Matrix, Model, Points
+
+_FLAT_IF = ((0.95, 0.01), (0.85, 0.03))  # share of points that agree, at a slant
+_FRAMES = 5  # like that
+
+
+class Flatness:
+    """What the frames until now say of one target with corners ``quad`` (4, 2)."""
+
+    def __init__(self, quad: Points) -> None:
+        self._quad = quad
+        self._frames = 0
+
+    @property
+    def is_proven(self) -> bool:
+        return self._frames >= _FRAMES
+
+    def learn(self, frame_from_template: Matrix, share: float) -> None:
+        """Take in a pose with which a ``share`` (0..1) of the points in view agree."""
+        if self.is_proven:
+            return
+        seen_from = slant(frame_from_template, self._quad)
+        self._frames += any(share >= least and seen_from >= far for least, far in _FLAT_IF)
+
+
+def slant(pose: Matrix, quad: Points) -> float:
+    """How far (RMS) the quad's corners in the frame are from any similarity, against its size."""
+    seen = geometry.transform_points(pose, quad)
+    errors = transfer_errors(fit(Model.SIMILARITY, quad, seen), quad, seen)
+    return float(np.sqrt(np.mean(errors**2) / abs(geometry.signed_area(seen))))

@@ -11,8 +11,9 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -29,6 +30,7 @@ from streamtrack.sources.synthetic import SyntheticSource  # noqa: E402
 
 VGA = "MJPG 640 480 30"
 PAGE = os.sysconf("SC_PAGE_SIZE")
+WAIT_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -124,8 +126,72 @@ class TrackerProcess:
 
     def cpu_s(self) -> float:
         """Seconds of processor time so far, children's not included."""
-        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        return _cpu_s(self.process.pid)
+
+
+class Run:
+    """A watched run as a child, and all the lines it told so far."""
+
+    def __init__(self, folder: Path, env: dict[str, str] | None = None, **given: Any) -> None:
+        self.lines: list[dict[str, Any]] = []
+        self.process = subprocess.Popen(
+            [sys.executable, str(ROOT / "scripts" / "watched_run.py"), json.dumps(given)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            cwd=folder,
+            env={**(env or os.environ), "PYTHONPATH": str(ROOT)},
+            text=True,
+        )
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.process.kill()
+        self.process.wait()
+        self._thread.join()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for text in self.process.stdout:
+            self.lines.append(json.loads(text))
+
+    def of(self, kind: str, since: float = 0.0) -> list[dict[str, Any]]:
+        return [line for line in list(self.lines) if line["kind"] == kind and line["t"] >= since]
+
+    def wait(self, is_so: Callable[[], Any], what: str, timeout_s: float = WAIT_S) -> Any:
+        end_s = time.monotonic() + timeout_s
+        while not (found := is_so()):
+            if time.monotonic() > end_s or self.process.poll() is not None:
+                raise AssertionError(
+                    f"no {what}: {[ln for ln in self.lines if ln['kind'] != 'frame'][-8:]}"
+                )
+            time.sleep(0.01)
+        return found
+
+    def settle(self, frames: int = 60) -> None:
+        since = time.time()
+        self.wait(lambda: len(self.of("frame", since)) >= frames, f"{frames} frames")
+
+    def said(self, words: str, since: float) -> dict[str, Any] | None:
+        return next((line for line in self.of("log", since) if words in line["text"]), None)
+
+    def rss_mb(self) -> float:
+        return _rss_mb(self.process.pid)
+
+    def cpu_s(self) -> float:
+        return _cpu_s(self.process.pid)
+
+    def stop(self) -> float:
+        """SIGTERM; the seconds to its end."""
+        began = time.monotonic()
+        self.process.send_signal(signal.SIGTERM)
+        self.process.wait(30)
+        took_s = time.monotonic() - began
+        self._thread.join()
+        return took_s
 
 
 def _rss_mb(pid: int) -> float:
@@ -133,6 +199,11 @@ def _rss_mb(pid: int) -> float:
         return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * PAGE / 1e6
     except (OSError, IndexError):
         return 0.0
+
+
+def _cpu_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _descendants(pid: int) -> list[int]:

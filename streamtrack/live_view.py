@@ -44,6 +44,10 @@ _MAX_SIDE = 640
 _JPEG_QUALITY = 75
 _RESTART_S = (1.0, 60.0)
 _POLL_S = 0.2
+_HAND_OVER_S = 0.15
+"""What comes within it is handed over together: of each message that it reads from a pipe, the
+process keeps 1 to 3 KB for ever (Rerun 0.41), whatever its limit; `LiveServer.check` ends it then.
+"""
 _LAST_LOOK_S = 0.2
 """Left to the process to hand on what came last, before it is ended."""
 
@@ -210,7 +214,7 @@ class LiveView:
         log.video = jpeg_video(self._stream, self._clock, _JPEG_QUALITY)
         log.begin()
         channel = _Channel(log, output, self._server)
-        channel.show(lambda _: None)
+        channel.hand_over()
         return channel
 
     def _serve(self, channel: _Channel) -> None:
@@ -218,13 +222,16 @@ class LiveView:
         checked_s = time.monotonic()
         while True:
             try:
-                show = self._waiting.get(timeout=_POLL_S)
+                show = self._waiting.get(timeout=channel.due_s())
             except queue.Empty:
+                channel.hand_over()
                 if self._end.is_set():
                     time.sleep(_LAST_LOOK_S)
                     return
             else:
                 channel.show(show)
+                if channel.due_s() <= 0:
+                    channel.hand_over()
             if (now := time.monotonic()) - checked_s > 1.0:
                 checked_s = now
                 self._server.check()
@@ -237,10 +244,23 @@ class _Channel:
         self._log = log
         self._output = output
         self._server = server
+        self._is_pending = False
+        self._handed_over_s = 0.0
 
     def show(self, show: Callable[[StepLog], object]) -> None:
-        """Raises ServerError if it cannot be handed over."""
+        """Have something shown once it is handed over."""
         show(self._log)
+        self._is_pending = True
+
+    def due_s(self) -> float:
+        """How long to wait for more before handing over; not negative."""
+        if not self._is_pending:
+            return _POLL_S
+        return max(0.0, self._handed_over_s + _HAND_OVER_S - time.monotonic())
+
+    def hand_over(self) -> None:
+        """Raises ServerError if that cannot be done."""
+        self._is_pending, self._handed_over_s = False, time.monotonic()
         self._server.write(self._output.read(flush=True) or b"")
 
 

@@ -7,7 +7,6 @@ import gc
 import logging
 import os
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -35,7 +34,7 @@ from streamtrack.sources.capture import (
 from streamtrack.sources.live import LiveSource
 from streamtrack.sources.network import NetworkCapture
 from streamtrack.sources.video import VideoSource
-from tests import servers
+from tests import rtsp_server, servers
 from tests.servers import Server, eventually, jpeg, mjpeg, number_of, part, silence
 
 QUICK = LiveSettings(open_timeout_s=8.0, stall_timeout_s=0.6)
@@ -619,78 +618,22 @@ def test_ctrl_c_ends_a_running_and_a_hung_stream_at_once() -> None:
 
 # -- RTSP ---------------------------------------------------------------------------------------
 
-_RTSP_SERVER = """
-import sys, gi
-gi.require_version("Gst", "1.0")
-gi.require_version("GstRtspServer", "1.0")
-from gi.repository import GLib, Gst, GstRtspServer
-Gst.init(None)
-server = GstRtspServer.RTSPServer()
-server.set_address("127.0.0.1")
-server.set_service(sys.argv[1])
-factory = GstRtspServer.RTSPMediaFactory()
-factory.set_shared(True)
-factory.set_launch(
-    "( videotestsrc is-live=true pattern=ball ! video/x-raw,width=320,height=240,framerate=30/1 "
-    "! x264enc tune=zerolatency speed-preset=ultrafast key-int-max=30 "
-    "! rtph264pay name=pay0 config-interval=0 )"
-)
-if len(sys.argv) > 2:
-    auth = GstRtspServer.RTSPAuth()
-    token = GstRtspServer.RTSPToken()
-    token.set_string("media.factory.role", "user")
-    auth.add_basic(GstRtspServer.RTSPAuth.make_basic(*sys.argv[2:]), token)
-    server.set_auth(auth)
-    permissions = GstRtspServer.RTSPPermissions()
-    permissions.add_permission_for_role("user", "media.factory.access", True)
-    permissions.add_permission_for_role("user", "media.factory.construct", True)
-    factory.set_permissions(permissions)
-server.get_mount_points().add_factory("/cam", factory)
-if not server.attach(None):
-    sys.exit("port taken")
-print(server.get_bound_port(), flush=True)
-GLib.MainLoop().run()
-"""
-_PYTHON = "/usr/bin/python3"
-
-
-def gstreamer_missing() -> str:
-    """Why GStreamer's RTSP server cannot be started, or empty."""
-    probe = (
-        "import gi; gi.require_version('Gst', '1.0'); gi.require_version('GstRtspServer', '1.0'); "
-        "from gi.repository import Gst, GstRtspServer; Gst.init(None); "
-        "assert Gst.ElementFactory.find('x264enc') and Gst.ElementFactory.find('rtph264pay')"
-    )
-    if not shutil.which(_PYTHON):
-        return f"no {_PYTHON}"
-    done = subprocess.run([_PYTHON, "-c", probe], capture_output=True, timeout=30)
-    return "" if done.returncode == 0 else "scripts/setup-servers was not run"
-
 
 @pytest.fixture(scope="module")
 def start_rtsp() -> Iterator[Callable[..., tuple[subprocess.Popen[str], int]]]:
     """``start_rtsp(port=0, *credentials)`` gives the server's process and its port."""
-    if reason := gstreamer_missing():
+    if reason := rtsp_server.missing():
         pytest.skip(f"GStreamer's RTSP server: {reason}")
     running: list[subprocess.Popen[str]] = []
 
     def start(port: int = 0, *credentials: str) -> tuple[subprocess.Popen[str], int]:
-        server = subprocess.Popen(
-            [_PYTHON, "-c", _RTSP_SERVER, str(port), *credentials],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        )
+        server, port = rtsp_server.start(port, *credentials)
         running.append(server)
-        assert server.stdout is not None
-        return server, int(server.stdout.readline())
+        return server, port
 
     yield start
     for server in running:
-        server.kill()
-        server.wait()
-        assert server.stdout is not None
-        server.stdout.close()
+        rtsp_server.stop(server)
 
 
 RtspStarter = Callable[..., tuple[subprocess.Popen[str], int]]

@@ -57,7 +57,8 @@ def main() -> int:
         f"age at output: p50 {p50:.1f} ms, p95 {p95:.1f} ms, p99 {p99:.1f} ms, "
         f"most {ages[-1]:.1f} ms\n"
         f"{len(cores)} cores{', served first' if options.first else ''}, "
-        f"load {os.getloadavg()[0]:.1f}; the tracker took {100 * cpu_share:.0f} % of a core; SIGTERM to exit {ended_s:.2f} s"
+        f"load {os.getloadavg()[0]:.1f}; the tracker took {100 * cpu_share:.0f} % of a core; "
+        f"SIGTERM to exit {ended_s:.2f} s"
     )
     return 0 if p95 <= MOST_P95_MS and missing == 0 else 1
 

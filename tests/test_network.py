@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import av
+import cv2
 import numpy as np
 import pytest
 
@@ -558,6 +559,63 @@ def test_a_camera_that_stalls_breaks_off_and_changes_its_size_is_followed(
     assert status.age_ms_p95 is not None and status.age_ms_p95 < 200
     assert all(b.time_s > a.time_s for a, b in pairwise(frames))
     assert "geheim" not in caplog.text and "me:" not in caplog.text
+
+
+SECRETS = ("geheimnis", "nutzer", "abrakadabra")
+
+
+def _processes_below(pid: int) -> list[int]:
+    below = list(servers.children_of(pid))
+    return below + [deeper for child in below for deeper in _processes_below(child)]
+
+
+@pytest.mark.parametrize("leaf", ["cam", "no-such-thing"])
+def test_secrets_of_an_address_appear_nowhere(
+    tmp_path: Path, leaf: str, make_picture: Callable[..., Any]
+) -> None:
+    """The whole program: its lines, all its files and their names, and what `ps` shows."""
+    textured = bytes(cv2.imencode(".jpg", make_picture(1, (320, 240)))[1])
+
+    def camera(connection: socket.socket) -> None:
+        servers.read_request(connection)
+        connection.sendall(servers.MJPEG_HEADER)
+        for _ in range(12):
+            connection.sendall(part(textured))
+            time.sleep(0.1)
+
+    def handle(connection: socket.socket) -> None:
+        if b"/cam" in connection.recv(65536, socket.MSG_PEEK):
+            servers.protected("nutzer", "geheimnis", camera)(connection)
+        else:
+            connection.recv(65536)
+            connection.sendall(b"HTTP/1.0 404 Not Found\r\nContent-Length: 0\r\n\r\n")
+
+    titles = b""
+    with Server(handle) as server:
+        address = f"http://nutzer:geheimnis@127.0.0.1:{server.port}/{leaf}?token=abrakadabra"
+        outputs = ("--output", "tracks.csv", "--poses", "poses.csv", "--summary", "summary.json")
+        command = [sys.executable, "-m", "streamtrack.cli", "track", address, *outputs]
+        with subprocess.Popen(
+            [*command, "--target", "10,10,120,90", "--retries", "0", "--record-video", "jpeg"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)},
+        ) as program:
+            assert program.stdout is not None
+            # Python itself has to start before it can hide anything.
+            assert eventually(lambda: server.accepted or program.poll() is not None, 60)
+            for pid in (program.pid, *_processes_below(program.pid)):
+                with contextlib.suppress(OSError):
+                    titles += Path(f"/proc/{pid}/cmdline").read_bytes()
+            said = program.stdout.read()
+    assert b"127.0.0.1" in titles
+    assert b"127.0.0.1" in said
+    files = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert (leaf == "cam") == any(path.suffix == ".rrd" for path in files)
+    shown = [titles, said, *(path.read_bytes() + path.name.encode() for path in files)]
+    for secret in SECRETS:
+        assert not any(secret.encode() in text for text in shown), secret
 
 
 _SIGNALLED_PROGRAM = """

@@ -16,6 +16,7 @@ import typer
 from streamtrack.cli.bench import bench_app
 from streamtrack.cli.devices import devices
 from streamtrack.cli.mosaic import mosaic
+from streamtrack.cli.process import hide_secrets, limit_arenas
 from streamtrack.cli.tools import synth, view
 from streamtrack.cli.track import track
 from streamtrack.errors import StreamtrackError, UsageError
@@ -48,6 +49,8 @@ def main() -> None:
     os.environ.setdefault("MIMALLOC_PURGE_DELAY", "0")
     # Its matrices are small: threads for them only wait for each other, at full speed.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    limit_arenas()
+    hide_secrets(sys.argv)
     exit_on_error(lambda: app(with_live_address(sys.argv[1:]), standalone_mode=False))
 
 

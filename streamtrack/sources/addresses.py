@@ -80,7 +80,7 @@ class Redactor:
     def __init__(self, address: str) -> None:
         self._address = address
         self._shown = redacted(address)
-        self._secrets = sorted(_secrets(address), key=len, reverse=True)
+        self._secrets = sorted(secrets_of(address), key=len, reverse=True)
 
     def __call__(self, text: str) -> str:
         """``text`` without the secrets."""
@@ -91,7 +91,7 @@ class Redactor:
         return _SECRET_PAIR.sub(r"\1\2=***", text)
 
 
-def _secrets(address: str) -> set[str]:
+def secrets_of(address: str) -> set[str]:
     """Passwords, and users that come with one, as written and as meant."""
     _, _, rest = address.partition("://")
     userinfo, separator, plain = rest.rpartition("@")

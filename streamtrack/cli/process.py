@@ -1,0 +1,46 @@
+"""What the program does to its own process before it works: its memory, and what `ps` shows."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from streamtrack.sources.addresses import secrets_of
+
+_M_ARENA_MAX = -8
+_ARG_START, _ARG_END = 48, 49
+
+
+def limit_arenas() -> None:
+    """Have glibc keep freed memory in two places, not one a thread; elsewhere nothing happens.
+
+    Frames pass from thread to thread: in runs of weeks each thread's share would fill up with
+    holes (mallopt(3), M_ARENA_MAX).
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).mallopt(ctypes.c_int(_M_ARENA_MAX), ctypes.c_int(2))
+
+
+def hide_secrets(arguments: Sequence[str]) -> None:
+    """Overwrite passwords of addresses in what ``ps`` and /proc show of this process.
+
+    Linux only (proc(5): arg_start, arg_end); the arguments that Python holds stay as they are.
+    """
+    found = {secret for text in arguments if "://" in text for secret in secrets_of(text)}
+    if not found or not sys.platform.startswith("linux"):
+        return
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        fields = Path("/proc/self/stat").read_text("ascii", errors="replace")
+        # The second field, the program's name, may hold anything.
+        numbers = fields.rpartition(")")[2].split()
+        start, end = (int(numbers[place - 3]) for place in (_ARG_START, _ARG_END))
+        shown = Path("/proc/self/cmdline").read_bytes()
+        if not 0 < len(shown) <= end - start:
+            return
+        for secret in sorted(found, key=len, reverse=True):
+            raw = secret.encode(errors="surrogateescape")
+            shown = shown.replace(raw, b"*" * len(raw))
+        ctypes.memmove(start, shown, len(shown))

@@ -30,6 +30,7 @@ Doubles: TypeAlias = npt.NDArray[np.float64]
 
 _LEAST_PIXELS = (1000, 250, 60, 30, 20)  # in view, by level
 _ROUNDS = (6, 8, 4, 4, 4)  # at most, by level
+_SAME_PX = 0.5  # of a level: starts that differ by no more lead to the same end
 _MAX_LAST_STEP_PX = 1.0  # of a fit that counts as converged
 _CONVERGED_PX = 0.01
 _CONVERGED_COARSE_PX = 0.15
@@ -107,7 +108,7 @@ def align(
     fitted: _Fitted | None = None
     start = view_from_reference
     for level in range(last, USUAL - 1, -1):
-        if fitted is not None:
+        if fitted is not None and _differ(view_from_reference, start, view, level):
             # Coarse levels may lead astray where texture is fine or weak.
             tried = (view_from_reference, start)
             view_from_reference = max(tried, key=lambda m: _likeness(reference, view, level, m))
@@ -245,6 +246,14 @@ def _likeness(
     seen[depth <= 0] = 0
     wanted = pixels.values[::2]
     return float(wanted @ seen) / float(np.sqrt((wanted @ wanted) * (seen @ seen)) + 1.0)
+
+
+def _differ(one: Matrix, other: Matrix, view: ViewLevels, level: int) -> bool:
+    """Whether two mappings into a view differ by more than rounding, in pixels of a level."""
+    corners = geometry.image_quad(view.size_wh)
+    off = geometry.transform_points(one, corners) - geometry.transform_points(other, corners)
+    level_px = view.size_wh[0] / view.images[level].shape[1]
+    return not float(np.abs(off).max()) <= _SAME_PX * level_px
 
 
 def _make_prior() -> Doubles:

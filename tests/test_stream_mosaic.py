@@ -109,8 +109,10 @@ def test_it_grows_in_all_directions_in_little_memory(
             assert (mosaic.spilled_mb > 1) == (max_mb < 1)
         assert exported is not None
         shown[max_mb] = preview.preview, read(tmp_path / f"{max_mb}.png")
-    for spilled, kept in zip(shown[0.5], shown[400.0], strict=True):
-        np.testing.assert_array_equal(spilled, kept)
+    np.testing.assert_array_equal(shown[0.5][1], shown[400.0][1])
+    # What is painted again may come from a frame in memory or from its JPEG.
+    differences = np.abs(shown[0.5][0].astype(int) - shown[400.0][0])
+    assert differences.max() <= 8 and differences.mean() < 0.1
     picture = shown[0.5][1]
     x, y = (exported.picture_from_world[:2, 2] - (420, 340)).astype(int).tolist()
     there = land[-y : -y + picture.shape[0], -x : -x + picture.shape[1]]

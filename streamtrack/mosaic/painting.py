@@ -115,7 +115,8 @@ def weighted(image: Image, quads: Sequence[Points] = (), scale: float = 1.0) -> 
         for quad in quads:
             inside = np.clip(geometry.transform_points(to_scale, quad), -(2**14), 2**14)
             cv2.fillPoly(weight, [np.rint(inside).astype(np.int32)], 0)
-    return np.asarray(cv2.merge([*cv2.split(bgr), weight]), np.uint8)
+    pixels = cv2.cvtColor(bgr, cv2.COLOR_BGR2BGRA)
+    return np.asarray(cv2.insertChannel(weight, pixels, 3), np.uint8)
 
 
 def scaled_size(size_wh: Size, scale: float) -> Size:
@@ -148,12 +149,9 @@ def with_gain(pixels: Image, log_gain: npt.NDArray[np.float64]) -> Image:
     """BGRW pixels with each colour multiplied by exp(log_gain), the weight untouched."""
     if np.max(np.abs(log_gain)) < 0.004:
         return pixels
-    *colours, weight = cv2.split(pixels)
-    factors = np.exp(log_gain)
-    brighter = [
-        cv2.convertScaleAbs(c, alpha=float(f)) for c, f in zip(colours, factors, strict=True)
-    ]
-    return np.asarray(cv2.merge([*brighter, weight]), np.uint8)
+    factors = np.append(np.exp(log_gain), 1.0)
+    table = np.rint(np.minimum(np.arange(256.0)[:, None] * factors, 255)).astype(np.uint8)
+    return np.asarray(cv2.LUT(pixels, table[None]), np.uint8)
 
 
 def quartered(pixels: Image) -> Image:
@@ -236,17 +234,9 @@ def _blended(old: Image, new: Image, alpha: Image) -> Image:
     """``new`` over ``old`` (H, W, 4) by the share ``alpha`` (H, W) of 255."""
     result = old.copy()
     cv2.copyTo(new, cv2.inRange(alpha, 255, 255), result)
-    band = cv2.inRange(alpha, 1, 254)
-    count = cv2.countNonZero(band)
-    if count > alpha.size // 16:
-        share = cv2.merge([alpha] * 4)
-        over = cv2.multiply(new, share, scale=1 / 255)
-        under = cv2.multiply(old, cv2.bitwise_not(share), scale=1 / 255)
-        result = np.asarray(cv2.add(over, under), np.uint8)
-    elif count:
-        column, row = np.asarray(cv2.findNonZero(band)).reshape(-1, 2).T
-        some = alpha[row, column, None].astype(np.float32) / 255.0
-        before = old[row, column].astype(np.float32)
-        mixed = before + some * (new[row, column].astype(np.float32) - before)
-        result[row, column] = np.rint(mixed).astype(np.uint8)
+    x, y, width, height = cv2.boundingRect(cv2.inRange(alpha, 1, 254))
+    if width:
+        part = slice(y, y + height), slice(x, x + width)
+        share = alpha[part].astype(np.float32) / np.float32(255)
+        result[part] = cv2.blendLinear(new[part], old[part], share, 1 - share)
     return result

@@ -66,6 +66,13 @@ class Renderer:
                 chooser.add(self._warped(view, reach, box), is_primary)
                 yield
 
+    def remember(self, view: View, pixels: Image) -> None:
+        """Keep a view's pixels, `painting.weighted` at min(1, scale), as if it were decoded."""
+        self._decoded[view.number] = pixels
+        self._bytes += pixels.nbytes
+        while self._bytes > self._max_bytes and len(self._decoded) > _LEAST_CACHED:
+            self._bytes -= self._decoded.popitem(last=False)[1].nbytes
+
     def forget(self, view: View) -> None:
         """Let go of a view that was dropped."""
         pixels = self._decoded.pop(view.number, None)
@@ -100,8 +107,5 @@ class Renderer:
             return pixels
         image = self._store.image_of(view)
         pixels = painting.weighted(image, view.quads, min(1.0, self._scale))
-        self._decoded[view.number] = pixels
-        self._bytes += pixels.nbytes
-        while self._bytes > self._max_bytes and len(self._decoded) > _LEAST_CACHED:
-            self._bytes -= self._decoded.popitem(last=False)[1].nbytes
+        self.remember(view, pixels)
         return pixels

@@ -10,8 +10,8 @@ kept, at their final poses (see `export`).
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,7 +45,7 @@ MOST_EXTENT_PX = 100_000.0
 
 _LEAST_SHARE = 0.01
 _MOVED_PX = 0.5
-_CHECKED_A_FRAME = 64
+_CHECKED_A_FRAME, _MOVED_A_FRAME = 64, 6
 _SAMPLES_TO_JUDGE = 3
 _LEAST_CONTESTED = 16
 _TILE_SHARE, _VIEW_SHARE, _CACHE_SHARE = 0.5, 0.2, 0.15
@@ -119,7 +119,7 @@ class StreamMosaic:
         self._moment = -1
         self._waiting: _Waiting | None = None
         self._outline: Points | None = None
-        self._checking: Iterator[list[View]] | None = None
+        self._checking: deque[View] = deque()
         self._revision = 0 if graph is None else graph.revision
         self._full = ""
         self.figures = StreamFigures()
@@ -239,6 +239,7 @@ class StreamMosaic:
 
     def _paint(self, image: Image, view: View) -> None:
         pixels = painting.weighted(image, view.quads, self._scale)
+        self._renderer.remember(view, pixels)
         pixels = painting.with_gain(pixels, view.log_gain)
         factor = pixels.shape[1] / view.size_wh[0], pixels.shape[0] / view.size_wh[1]
         canvas_from_frame = geometry.scaling(self._scale) @ view.world_from_frame
@@ -283,35 +284,32 @@ class StreamMosaic:
             return
         if self._graph is not None and self._graph.revision != self._revision:
             self._revision = self._graph.revision
-            self._checking = _chunks(list(self._store.views.values()), _CHECKED_A_FRAME)
-        if self._checking is not None:
-            chunk = next(self._checking, None)
-            if chunk is None:
-                self._checking = None
-            else:
-                self._check(chunk)
+            self._checking = deque(self._store.views.values())
+        self._check(_CHECKED_A_FRAME, _MOVED_A_FRAME)
         try:
             self._rerender.step((float(self._near[0]), float(self._near[1])))
         except OutputError as error:
             self._full = self._full or f"parts of the mosaic are not brought up to date: {error}"
 
-    def _check(self, views: Sequence[View]) -> None:
-        """Take over poses that changed by more than half a pixel."""
+    def _check(self, most: int, most_moved: float) -> None:
+        """Take over poses that changed by more than half a pixel, of so many of the views."""
         store, rerender = self._parts()
-        for view in views:
-            if view.number not in store.views:
-                continue
-            known = self._known_pose(view.frame, view.world_from_frame)
-            corners = geometry.image_quad(view.size_wh)
-            before = geometry.transform_points(view.world_from_frame, corners)
-            after = geometry.transform_points(known, corners)
-            moved_px = np.max(np.hypot(*(after - before).T)) * self._scale
+        views = [self._checking.popleft() for _ in range(min(most, len(self._checking)))]
+        views = [view for view in views if view.number in store.views]
+        known = [self._known_pose(view.frame, view.world_from_frame) for view in views]
+        moved = 0
+        for row in _moved_rows(views, known, _MOVED_PX / self._scale):
+            view = views[row]
+            if moved >= most_moved:
+                self._checking.extendleft(reversed(views[row:]))
+                return
             extent = MOST_EXTENT_PX / self._scale
-            if moved_px > _MOVED_PX and not painting.refusal(known, view.size_wh, extent):
+            if not painting.refusal(known[row], view.size_wh, extent):
                 rerender.mark(store.tiles_of(view))
-                store.move(view, known)
+                store.move(view, known[row])
                 rerender.mark(store.tiles_of(view))
                 self.figures.moved_views += 1
+                moved += 1
 
     def catch_up(self, most: int | None = None) -> bool:
         """Do up to ``most`` pieces of waiting work (None: all); True if nothing is left to do.
@@ -320,7 +318,7 @@ class StreamMosaic:
         """
         while self._store is not None and (most is None or most > 0):
             most = None if most is None else most - 1
-            is_idle = not len(self._rerender) and self._checking is None
+            is_idle = not len(self._rerender) and not self._checking
             if is_idle and (self._graph is None or self._graph.revision == self._revision):
                 return True
             self._work()
@@ -369,12 +367,20 @@ class StreamMosaic:
                 return None
             raise OutputError(f"no frame could be placed: {path} is not written")
         self._keep_waiting()
-        self._check(list(self._store.views.values()))
+        self._checking = deque(self._store.views.values())
+        self._check(len(self._checking), math.inf)
         if path is None:
             return None
         return export(self._store, path, self._settings, advance)
 
 
-def _chunks(views: list[View], size: int) -> Iterator[list[View]]:
-    for start in range(0, len(views), size):
-        yield views[start : start + size]
+def _moved_rows(views: Sequence[View], known: Sequence[Matrix], least_px: float) -> list[int]:
+    """Which of the views have a corner that lies elsewhere by other poses (world pixels)."""
+    if not views:
+        return []
+    corners = np.stack([geometry.image_quad(view.size_wh) for view in views]).astype(np.float64)
+    homogeneous = np.concatenate([corners, np.ones((len(views), 4, 1))], axis=2)
+    now = np.stack([view.world_from_frame for view in views])
+    before, after = (homogeneous @ poses.transpose(0, 2, 1) for poses in (now, np.stack(known)))
+    off = after[..., :2] / after[..., 2:] - before[..., :2] / before[..., 2:]
+    return np.flatnonzero(np.hypot(*off.T).T.max(axis=1) > least_px).tolist()

@@ -1,17 +1,20 @@
 """streamtrack mosaic beside OpenCV's Stitcher, the `stitching` package and hugin, in one run.
 
-    python scripts/compare_stitchers.py SET... [--reps 3] [--out FOLDER]
+    python scripts/compare_stitchers.py SET... [--reps 3] [--out FOLDER] [--stitching PYTHON]
 
-Each SET is a folder, or pictures joined by commas. Every peer is a fresh process that reads the
-pictures, joins them and writes a PNG; imports are included. Reported are the median of user + sys
-CPU seconds, the peak memory, the size of the result, and how many pictures are in it if the peer
-says so. What is not installed is skipped with a word. OpenCV's Stitcher runs in both its modes.
+Each SET is a folder, or pictures joined by commas. `stitching` brings an OpenCV of its own, so
+it is best installed elsewhere (python -m venv peers; peers/bin/pip install stitching-headless)
+and named: --stitching peers/bin/python. Hugin: apt install hugin-tools enblend.
+
+Every peer is a fresh process that reads the pictures, joins them and writes a PNG; imports are
+included. Reported are the median of user + sys CPU seconds, the peak memory, the size of the
+result, and how many pictures are in it if the peer says so. What is not installed is skipped with
+a word. OpenCV's Stitcher runs in both its modes.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import os
 import shutil
@@ -42,11 +45,13 @@ _STITCHING = """
 import sys, cv2
 from stitching import Stitcher
 out, *names = sys.argv[1:]
-cv2.imwrite(out, Stitcher(crop=False).stitch(names))
+stitcher = Stitcher(crop=False)
+cv2.imwrite(out, stitcher.stitch(names))
+print(len(stitcher.images.names))
 """
 
 
-def peers(names: list[str], out: Path) -> dict[str, list[list[str]] | str]:
+def peers(names: list[str], out: Path, stitching: str) -> dict[str, list[list[str]] | str]:
     """Commands of each peer, run one after the other, or why it is skipped."""
     python = sys.executable
     ours = [python, "-m", "streamtrack.cli", "mosaic", *names, "-o", str(out)]
@@ -55,10 +60,10 @@ def peers(names: list[str], out: Path) -> dict[str, list[list[str]] | str]:
         "opencv PANORAMA": [[python, "-c", _OPENCV, "PANORAMA", str(out), *names]],
         "opencv SCANS": [[python, "-c", _OPENCV, "SCANS", str(out), *names]],
     }
-    if importlib.util.find_spec("stitching") is None:
+    if subprocess.run([stitching, "-c", "import stitching"], capture_output=True).returncode:
         found["stitching"] = "skipped: not installed (pip install stitching-headless)"
     else:
-        found["stitching"] = [[python, "-c", _STITCHING, str(out), *names]]
+        found["stitching"] = [[stitching, "-c", _STITCHING, str(out), *names]]
     tools = ("pto_gen", "cpfind", "cpclean", "autooptimiser", "pano_modify", "nona", "enblend")
     missing = [tool for tool in tools if shutil.which(tool) is None]
     if missing:
@@ -106,7 +111,7 @@ def run(commands: list[list[str]]) -> tuple[float, float, float, str, str]:
         process.returncode = os.waitstatus_to_exitcode(status)
         cpu_s += usage.ru_utime + usage.ru_stime
         peak_mb = max(peak_mb, usage.ru_maxrss / 1000)
-        lines = text.strip().splitlines()
+        lines = [line for line in text.strip().splitlines() if ": info:" not in line]
         said = lines[-1] if lines else ""
         if process.returncode:
             return cpu_s, time.perf_counter() - began, peak_mb, said, said[:60] or "failed"
@@ -117,7 +122,7 @@ def used(peer: str, out: Path, said: str, count: int) -> str:
     """How many of the pictures the peer says it used."""
     if peer == "streamtrack":
         return f"{json.loads(Path(f'{out}.json').read_text())['frames']['used']}/{count}"
-    return f"{said}/{count}" if peer.startswith("opencv") else f"-/{count}"
+    return f"-/{count}" if peer == "hugin" else f"{said}/{count}"
 
 
 def main() -> None:
@@ -125,6 +130,7 @@ def main() -> None:
     parser.add_argument("sets", nargs="+")
     parser.add_argument("--reps", type=int, default=3)
     parser.add_argument("--out", type=Path, default=Path("stitchers"))
+    parser.add_argument("--stitching", default=sys.executable, help="the Python that has it")
     parser.add_argument("--only", help="peers to run, joined by commas")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
@@ -132,7 +138,7 @@ def main() -> None:
     for given in options.sets:
         parts = given.split(",")
         names = [str(path) for path in find_pictures(parts[0] if len(parts) == 1 else parts)]
-        for peer, commands in peers(names, Path("x.png")).items():
+        for peer, commands in peers(names, Path("x.png"), options.stitching).items():
             if options.only and peer.split()[0] not in options.only.split(","):
                 continue
             label = f"{Path(parts[0]).name}{len(names)}"
@@ -140,7 +146,7 @@ def main() -> None:
                 print(f"| {label} | {peer} | - | - | - | {commands} | - |", flush=True)
                 continue
             out = options.out / f"{label}-{peer.replace(' ', '-')}.png"
-            commands = peers(names, out)[peer]
+            commands = peers(names, out, options.stitching)[peer]
             assert not isinstance(commands, str)
             results = [run(commands) for _ in range(options.reps)]
             cpu, wall, rss = (statistics.median(r[i] for r in results) for i in range(3))

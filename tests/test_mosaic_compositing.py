@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from streamtrack import geometry
-from streamtrack.mosaic.compositing import band_count, painted_bands, plan
+from streamtrack.mosaic.compositing import _tone_curve, band_count, painted_bands, plan
 from streamtrack.mosaic.exposure import compensation_gains, overlap_ncc
 from streamtrack.mosaic.projection import Canvas, View, lay_out, planar_views
 from streamtrack.mosaic.seams import SmallPatch, seam_masks
@@ -142,3 +142,13 @@ def test_a_reduced_canvas_does_not_alias() -> None:
     view = View("planar", geometry.scaling(1 / 8), (256, 256))
     image, _ = warp(stripes, view, (0, 0, 32, 32), "linear")
     assert np.all(np.abs(image[2:-2, 2:-2].astype(int) - 128) <= 2)
+
+
+@pytest.mark.parametrize("gain", [0.5, 0.9, 1.0, 1.1, 1.6, 2.0])
+def test_brightening_keeps_every_shade_apart(gain: float) -> None:
+    curve = _tone_curve(gain).astype(int)
+    dark = np.arange(int(0.7 * 255 / max(gain, 1)))
+    np.testing.assert_allclose(curve[dark], gain * dark, atol=0.51)
+    assert curve[255] == (255 if gain >= 1 else round(255 * gain))
+    assert np.all(np.diff(curve) >= 0)
+    assert len(np.unique(curve[128:])) >= 25  # plain multiplication by 2 leaves one

@@ -522,8 +522,23 @@ def test_a_large_canvas_is_scaled_and_that_is_said(flight: list[Path], tmp_path:
     assert outcome.summary.canvas_wh is not None
     width, height = outcome.summary.canvas_wh
     assert width * height <= 0.0205e6
-    assert any("scaled down" in note for note in outcome.summary.notes)
+    assert any("--max-megapixels" in note for note in outcome.summary.notes)
     assert outcome.summary.images[0].world_from_picture is not None
+
+
+def test_a_side_too_long_for_the_format_is_said_as_such(tmp_path: Path) -> None:
+    from conftest import _picture
+
+    strip = cv2.resize(_picture(5, (4000, 40)), (20_000, 200), interpolation=cv2.INTER_CUBIC)
+    paths = [tmp_path / "left.png", tmp_path / "right.png"]
+    cv2.imwrite(str(paths[0]), strip[:, :12_000])
+    cv2.imwrite(str(paths[1]), strip[:, 8_000:])
+    outcome = run(tmp_path, paths, output="m.webp")
+    assert outcome.error is None
+    assert outcome.summary.canvas_wh is not None
+    assert 16_000 < outcome.summary.canvas_wh[0] <= 16_383
+    (note,) = outcome.summary.notes
+    assert "a side" in note and "megapixels allows" not in note
 
 
 def test_little_memory_gives_the_same_picture(flight: list[Path], tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Annotated, Any
 
 import typer
@@ -25,20 +25,43 @@ _LIVE_ADDRESS = re.compile(r"(\S*:)?\d+")
 
 __all__ = ["app", "exit_on_error", "main", "with_live_address"]
 
-app = typer.Typer(
-    name="streamtrack",
-    help="Track objects in video, build mosaics of what the camera saw; see why in Rerun.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-)
-app.command()(track)
-app.command()(mosaic)
-app.command()(devices)
-app.command()(synth)
-app.command()(view)
-app.add_typer(bench_app, name="bench")
+_COMMANDS: tuple[Callable[..., None], ...] = (track, mosaic, devices, synth, view)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"streamtrack {version('streamtrack')}")
+        raise typer.Exit
+
+
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Track objects in video, build mosaics of what the camera saw; see why in Rerun."""
+
+
+def _program(commands: Iterable[Callable[..., None]]) -> typer.Typer:
+    """The program with these commands and ``bench``."""
+    program = typer.Typer(
+        name="streamtrack",
+        help="Track objects in video, build mosaics of what the camera saw; see why in Rerun.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )
+    program.callback()(_common)
+    for command in commands:
+        program.command()(command)
+    program.add_typer(bench_app, name="bench")
+    return program
+
+
+app = _program(_COMMANDS)
 
 
 def main() -> None:
@@ -51,7 +74,12 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     limit_arenas()
     hide_secrets(sys.argv)
-    exit_on_error(lambda: app(with_live_address(sys.argv[1:]), standalone_mode=False))
+    # Nothing plugs into pydantic here, and looking for it reads every installed package's metadata.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+    # Where one command is called, Typer need not work out the options of all the others.
+    called = [command for command in _COMMANDS if [command.__name__] == sys.argv[1:2]]
+    program = _program(called) if called else app
+    exit_on_error(lambda: program(with_live_address(sys.argv[1:]), standalone_mode=False))
 
 
 def with_live_address(arguments: list[str]) -> list[str]:
@@ -95,20 +123,3 @@ def exit_on_error(run: Callable[[], Any]) -> None:
 def _fail(message: object, code: int) -> None:
     sys.stderr.write(f"streamtrack: error: {message}\n")
     sys.exit(code)
-
-
-def _version(wanted: bool) -> None:
-    if wanted:
-        from importlib.metadata import version
-
-        typer.echo(f"streamtrack {version('streamtrack')}")
-        raise typer.Exit
-
-
-@app.callback()
-def _common(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
-    ] = False,
-) -> None:
-    """Track objects in video, build mosaics of what the camera saw; see why in Rerun."""

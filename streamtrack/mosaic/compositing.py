@@ -29,6 +29,7 @@ _BYTES_A_PIXEL = 40  # that blending needs at most
 _BLEND_SHARE = 0.05  # of the root of the canvas's area: how far pictures fade into each other
 _MOST_LEVELS = 6
 _FINE = 16  # OpenCV cuts off fractions at every level of the pyramids: of these, not of greys
+_SHOULDER = 0.75  # of white: where brightening begins to spare what is bright already
 _REACH = 3  # of a pyramid, in pixels of its coarsest level
 
 _T = TypeVar("_T", np.uint8, np.float32)
@@ -114,9 +115,24 @@ def _in_colour(image: Image) -> Image:
 
 
 def _brightened(image: Image, gain: npt.NDArray[np.float64]) -> Image:
+    """BGR (h, w, 3) times a factor a colour; what would become whiter than white keeps shades."""
     if np.max(np.abs(gain - 1)) < 1 / 512:
         return image
-    return np.asarray(cv2.multiply(image, np.array([*gain, 1.0])), np.uint8)
+    curves = np.stack([_tone_curve(float(one)) for one in gain], axis=1)
+    return np.asarray(cv2.LUT(image, curves[None]), np.uint8)
+
+
+def _tone_curve(gain: float) -> Image:
+    """Grey levels (256,) times ``gain``, those beyond the shoulder bent so that white is white."""
+    levels = np.arange(256) / 255.0
+    if gain <= 1:
+        return np.asarray(np.round(255 * gain * levels), np.uint8)
+    start = _SHOULDER / gain
+    beyond = (levels - start).clip(0) / (1 - start)
+    steep = gain * (1 - start) / (1 - _SHOULDER)  # continues the straight part's slope
+    bent = _SHOULDER + (1 - _SHOULDER) * steep * beyond / (1 + (steep - 1) * beyond)
+    curve = np.where(levels < start, gain * levels, bent)
+    return np.asarray(np.round(255 * curve), np.uint8)
 
 
 # -- painting -----------------------------------------------------------------------------------

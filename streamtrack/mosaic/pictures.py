@@ -205,18 +205,25 @@ def _canvas(
             f"the mosaic would have {width:.0f}x{height:.0f} px for {pixels / 1e6:.1f} megapixels "
             "of pictures: it is not painted; try --projection cylindrical or another --model"
         )
-    limit = min(1.0, np.sqrt(job.settings.mosaic.max_megapixels * 1e6 / (width * height)))
+    most_megapixels = job.settings.mosaic.max_megapixels
+    limit = min(1.0, np.sqrt(most_megapixels * 1e6 / (width * height)))
     sides = MOST_SIDE
     if job.outputs.image is not None:
         from streamtrack.mosaic.picture_files import most_side
 
         sides = min(sides, most_side(job.outputs.image) or sides)
+    is_long = (sides - 2) / max(width, height) < limit
     limit = float(min(limit, (sides - 2) / max(width, height)))
     canvas = lay_out(arrangement.views, reference_scale * limit)
     if limit < 1:
+        reason = (
+            f"longer than the {sides} px a side that can be written"
+            if is_long
+            else f"more than the {most_megapixels:g} that --max-megapixels allows"
+        )
         notes.append(
-            f"scaled down to {limit:.1%}: at full size it would have {width:.0f}x{height:.0f} px "
-            f"({width * height / 1e6:.0f} megapixels), more than --max-megapixels allows"
+            f"scaled down to {limit:.1%}: at full size it would have {width:.0f}x{height:.0f} px, "
+            f"{width * height / 1e6:.1f} megapixels, {reason}"
         )
     return Canvas(canvas.size_wh, canvas.patches, limit)
 

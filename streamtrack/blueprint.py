@@ -10,6 +10,7 @@ Entities:
     mosaic/state, source/state                           states of the mosaic, of a live source
     metrics/features, metrics/<name>/..., metrics/ms/... curves
     metrics/mosaic/..., metrics/age_ms, metrics/source/...
+    tracks                                               table of the targets, as it is now
     summary, log                                         text
 """
 
@@ -17,12 +18,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from streamtrack.settings import Settings
 from streamtrack.types import Size, TrackState
 
 APPLICATION_ID = "streamtrack"
@@ -43,6 +46,7 @@ MOSAIC_LINKS = "mosaic/links"
 MOSAIC_LOOPS = "mosaic/loops"
 MOSAIC_STATE = "mosaic/state"
 MOSAIC_CURVES = "metrics/mosaic"
+TRACKS = "tracks"
 SUMMARY = "summary"
 LOG = "log"
 
@@ -81,6 +85,21 @@ _TARGET_COLORS: tuple[Rgb, ...] = (
 )
 _STAGE_COLORS: tuple[Rgb, ...] = (BLUE, _GREEN, ORANGE, (240, 100, 160), (0, 200, 200), _GREY)
 _MAX_SIDE_BY_SIDE = 3
+
+
+class World(StrEnum):
+    """What a recording shows of the world: nothing, paths alone, or a growing mosaic below them."""
+
+    NONE = "none"
+    PATHS = "paths"
+    MOSAIC = "mosaic"
+
+
+def world_shown(settings: Settings, has_mosaic: bool) -> World:
+    """What the recording of a run shows; of a fixed camera the world is the picture."""
+    if has_mosaic:
+        return World.MOSAIC
+    return World.NONE if settings.camera == "fixed" else World.PATHS
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,42 +253,67 @@ def build(
     size_wh: Size,
     target_names: Sequence[str],
     timeline: str,
-    has_mosaic: bool = False,
+    world: World = World.NONE,
     is_live: bool = False,
     is_following: bool = False,
 ) -> rrb.Blueprint:
-    """The layout for a screen of about 1920x1080: picture and targets above, curves below.
+    """The layout for a screen of about 1920x1080: what the camera sees, and the world.
 
-    A mosaic stands beside the picture; a live source has a lane and curves of its own.
-    ``is_following`` keeps to the newest data, as a live view should.
+    They are two tabs where there is a world to show; the one with the targets that were named is
+    in front. ``is_following`` keeps to the newest data, as a live view should.
     """
     targets = [(name, TargetEntities.of(name)) for name in target_names]
     states = [entities.state for _, entities in targets]
-    states += [MOSAIC_STATE] if has_mosaic else []
+    states += [MOSAIC_STATE] if world is World.MOSAIC else []
     states += [SOURCE_STATE] if is_live else []
-    lanes = rrb.StateTimelineView(
+    lanes_share = 0.75 + 0.42 * min(len(states), 6)
+    camera = rrb.Vertical(
+        _camera_row(size_wh, targets, timeline),
+        _curves(targets, [], is_live),
+        _lanes(states),
+        row_shares=[6.0, 2.6, lanes_share],
+        name="Camera",
+    )
+    if world is World.NONE:
+        return whole_layout(camera, timeline, is_following)
+    around = rrb.Vertical(
+        _camera_view(size_wh), _tracks_view(), text_tabs(timeline), row_shares=[3.0, 2.4, 2.2]
+    )
+    curves = [_curve("Mosaic", [f"{MOSAIC_CURVES}/**"])] if world is World.MOSAIC else []
+    world_tab = rrb.Vertical(
+        rrb.Horizontal(_mosaic_view(), around, column_shares=[6.6, 3.4]),
+        *([_curves([], curves, is_live)] if curves else []),
+        _lanes(states),
+        row_shares=[7.0, *([1.8] if curves else []), lanes_share],
+        name="World",
+    )
+    tabs = rrb.Tabs(camera, world_tab, active_tab=0 if targets else 1)
+    return whole_layout(tabs, timeline, is_following)
+
+
+def _camera_row(
+    size_wh: Size, targets: Sequence[tuple[str, TargetEntities]], timeline: str
+) -> rrb.Horizontal:
+    """The picture, and beside it close-ups of the targets and the texts."""
+    rows_of_targets = len(targets) if len(targets) <= _MAX_SIDE_BY_SIDE else 1
+    side = rrb.Vertical(
+        *_close_ups(targets),
+        text_tabs(timeline, _tracks_view()),
+        row_shares=[1.0 + rows_of_targets, 3.0] if targets else [1.0],
+    )
+    return rrb.Horizontal(_camera_view(size_wh), side, column_shares=[5.0, 3.0])
+
+
+def _lanes(states: Sequence[str]) -> rrb.StateTimelineView:
+    return rrb.StateTimelineView(
         name="State",
         origin="/",
         contents=[f"/{path.lstrip('/')}" for path in states] or "/targets/**",
     )
-    rows_of_targets = len(targets) if len(targets) <= _MAX_SIDE_BY_SIDE else 1
-    side = rrb.Vertical(
-        *_close_ups(targets),
-        text_tabs(timeline),
-        row_shares=[1.0 + rows_of_targets, 3.0] if targets else [1.0],
-    )
-    pictures: list[Any] = [_camera_view(size_wh), *([_mosaic_view()] if has_mosaic else []), side]
-    shares = [4.0, 3.6, 2.4] if has_mosaic else [5.0, 3.0]
-    return whole_layout(
-        rrb.Vertical(
-            rrb.Horizontal(*pictures, column_shares=shares),
-            _curves(targets, has_mosaic, is_live),
-            lanes,
-            row_shares=[6.0, 2.6, 0.75 + 0.42 * min(len(states), 6)],
-        ),
-        timeline,
-        is_following,
-    )
+
+
+def _tracks_view() -> rrb.TextDocumentView:
+    return rrb.TextDocumentView(name="Tracks", origin=f"/{TRACKS}")
 
 
 def whole_layout(root: Any, timeline: str, is_following: bool = False) -> rrb.Blueprint:
@@ -289,8 +333,8 @@ def whole_layout(root: Any, timeline: str, is_following: bool = False) -> rrb.Bl
     )
 
 
-def text_tabs(timeline: str) -> rrb.Tabs:
-    """The log, and before it the summary."""
+def text_tabs(timeline: str, *more: Any) -> rrb.Tabs:
+    """The summary, in front, the log, and more."""
     return rrb.Tabs(
         rrb.TextLogView(
             name="Log",
@@ -300,13 +344,14 @@ def text_tabs(timeline: str) -> rrb.Tabs:
             ),
         ),
         rrb.TextDocumentView(name="Summary", origin=f"/{SUMMARY}"),
+        *more,
         active_tab=1,
     )
 
 
 def _mosaic_view() -> rrb.Spatial2DView:
     return rrb.Spatial2DView(
-        name="Mosaic", origin=f"/{MOSAIC}", contents=[f"/{MOSAIC}/**", f"- /{MOSAIC_STATE}"]
+        name="World", origin=f"/{MOSAIC}", contents=[f"/{MOSAIC}/**", f"- /{MOSAIC_STATE}"]
     )
 
 
@@ -339,9 +384,9 @@ def _close_ups(targets: Sequence[tuple[str, TargetEntities]]) -> list[Any]:
 
 
 def _curves(
-    targets: Sequence[tuple[str, TargetEntities]], has_mosaic: bool, is_live: bool
+    targets: Sequence[tuple[str, TargetEntities]], first: Sequence[Any], is_live: bool
 ) -> rrb.Horizontal | rrb.Tabs:
-    more: list[Any] = [_curve("Mosaic", [f"{MOSAIC_CURVES}/**"])] if has_mosaic else []
+    more: list[Any] = list(first)
     if is_live:
         age = _curve("Age of the frame in ms", [AGE_MS])
         more.append(rrb.Tabs(age, _curve("Frames not seen", [f"{SOURCE_COUNTS}/**"]), active_tab=0))

@@ -259,7 +259,8 @@ class MovingCamera:
         is_sure = found.inliers >= _MIN_AGREEING_CELLS
         if not is_sure:
             guess = geometry.inverted(found.reference_from_view)
-            exact = align_exactly(reference, self._levels.get(keyframe), guess)
+            before = self.graph.keyframes[keyframe].hidden
+            exact = align_exactly(reference, self._levels.get(keyframe), guess, before)
             if exact.reference_from_view is None:
                 return False
             keyframe_from_frame = geometry.inverted(exact.reference_from_view)
@@ -275,7 +276,8 @@ class MovingCamera:
         self, view: FrameView, reference: ReferenceView, world_from_frame: Matrix, link: Link | None
     ) -> None:
         frame = view.frame
-        self.graph.add_keyframe(frame.index, frame.time_s, frame.image, world_from_frame)
+        outlines = reference.hidden
+        self.graph.add_keyframe(frame.index, frame.time_s, frame.image, world_from_frame, outlines)
         if link is not None:
             self.graph.add_link(link, is_loop=False)
         self._levels.add(frame.index, reference.levels)
@@ -284,7 +286,8 @@ class MovingCamera:
     def _reference(self, keyframe: int) -> ReferenceView:
         reference = self._references.get(keyframe)
         if reference is None:
-            reference = ReferenceView(self._levels.get(keyframe))
+            hidden = self.graph.keyframes[keyframe].hidden
+            reference = ReferenceView(self._levels.get(keyframe), hidden)
             self._keep_reference(keyframe, reference)
         return reference
 

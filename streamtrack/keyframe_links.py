@@ -183,7 +183,8 @@ def measure_exactly(draft: Draft, new: NewKeyframe, levels: ViewLevels) -> None:
     if new.found is None or new.found.reference_from_view is None:
         return
     guess = geometry.inverted(new.found.reference_from_view)
-    exact = align_exactly(new.reference, levels, guess)
+    hidden = draft.keyframes[new.chained_to].hidden
+    exact = align_exactly(new.reference, levels, guess, hidden)
     if exact.reference_from_view is None:
         return
     draft.drop({(new.index, new.chained_to)})
@@ -233,12 +234,12 @@ def _try(draft: Draft, new: NewKeyframe, other: int, cache: LevelCache) -> Joine
     here, there = draft.keyframes[new.index], draft.keyframes[other]
     guess = geometry.inverted(here.world_from_keyframe) @ there.world_from_keyframe
     is_loop = other not in _recent(draft)
-    levels = cache.get(other)
-    found = align(new.reference, levels, guess)
+    levels, hidden = cache.get(other), there.hidden
+    found = align(new.reference, levels, guess, hidden)
     if found.reference_from_view is None and is_loop:
-        found = align(new.reference, levels, guess, is_searched=True)
+        found = align(new.reference, levels, guess, hidden, is_searched=True)
     if found.reference_from_view is not None:
-        found = align_exactly(new.reference, levels, found.reference_from_view)
+        found = align_exactly(new.reference, levels, found.reference_from_view, hidden)
     if found.reference_from_view is None:
         return None
     draft.add(link_of(other, new.index, found), is_loop)

@@ -21,7 +21,7 @@ from streamtrack import geometry
 from streamtrack.errors import OutputError
 from streamtrack.mosaic.spill import Slot, SpillFile
 from streamtrack.mosaic.types import KeyframeEdge, Link
-from streamtrack.types import Image, Matrix, Size
+from streamtrack.types import Image, Matrix, Points, Size
 
 _JPEG_QUALITY = 92
 _MAX_PICTURES_MB = 128.0
@@ -76,13 +76,17 @@ class StoredPicture:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
-    """One keyframe: the index and time of its frame, its picture and where it lies now."""
+    """One keyframe: the index and time of its frame, its picture and where it lies now.
+
+    ``hidden`` are quads (4, 2) in it that do not belong to the scene.
+    """
 
     index: int
     time_s: float
     size_wh: Size
     picture: StoredPicture
     world_from_keyframe: Matrix
+    hidden: tuple[Points, ...] = ()
 
     def image(self) -> Image:
         """The picture, (H, W, 3) BGR or (H, W) grey, decoded anew at every call."""
@@ -157,12 +161,18 @@ class KeyframeGraph:
         return self._frames.get(index)
 
     def add_keyframe(
-        self, index: int, time_s: float, image: Image, world_from_keyframe: Matrix
+        self,
+        index: int,
+        time_s: float,
+        image: Image,
+        world_from_keyframe: Matrix,
+        hidden: Sequence[Points] = (),
     ) -> Keyframe:
         """Take a frame as a keyframe; ``image`` is BGR or grey."""
         picture = self._pictures.add(image)
         size_wh = (image.shape[1], image.shape[0])
-        keyframe = Keyframe(index, time_s, size_wh, picture, world_from_keyframe)
+        outlines = tuple(hidden)
+        keyframe = Keyframe(index, time_s, size_wh, picture, world_from_keyframe, outlines)
         with self._lock:
             # Readers may be going through the old dict: it is replaced, not changed.
             self._keyframes = {**self._keyframes, index: keyframe}

@@ -77,12 +77,13 @@ class LiveView:
             for name, picture in (template_views or {}).items()
         }
         size_wh = round(source.size_wh[0] * self._factor), round(source.size_wh[1] * self._factor)
+        world = blueprint.world_shown(settings, has_mosaic)
         self._layout = Layout(
-            blueprint.build(size_wh, target_names, timeline_of(source), has_mosaic, source.is_live)
+            blueprint.build(size_wh, target_names, timeline_of(source), world, source.is_live)
         )
         self._stream = new_stream()
         self._clock = Clock(self._stream, source.is_live)
-        self._run_facts = source, settings, target_names, small
+        self._run_facts = source, settings, target_names, small, world
         self._last_s = 0.0
         self._last_mosaic_s = 0.0
         self._waiting: queue.Queue[Callable[[StepLog], object]] = queue.Queue(_MAX_QUEUE)

@@ -17,18 +17,18 @@ import rerun as rr
 
 from streamtrack import blueprint, recorded_rows
 from streamtrack.blueprint import TargetEntities
-from streamtrack.geometry import box_quad, inverted, quad_mapping, scaling, transform_points
+from streamtrack.geometry import box_quad, inverted, scaling, transform_points
 from streamtrack.mosaic.types import MosaicView
 from streamtrack.recorded_video import jpeg_of
-from streamtrack.types import Image, Matrix, Points, Size, Step, TrackState
+from streamtrack.types import Image, Matrix, Points, Size, Step
+from streamtrack.world import WorldPlace
 
 _IMAGE_EVERY_S = 1.0
 _MAX_SIDE = 768
 _MAX_BYTES = 256_000
 _QUALITIES = (80, 65, 50)
-_MAX_PATH = 2000
-_MIN_STEP_PX = 1.0
-_UNIT_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+_MAX_PATH = 1000
+_MOST_TARGETS = 64
 
 _STATE_COLORS: dict[str, blueprint.Rgb] = {
     "placed": blueprint.LANE_GREEN,
@@ -49,8 +49,9 @@ class MosaicLog:
         self._quality = 0
         self._state = ""
         self._shown_state = ""
-        self._paths: dict[str, _Path] = {}
-        self._centres: dict[str, Points] = {}
+        self._targets: dict[str, _Target] = {}
+        self._numbers = 0
+        self._places: dict[str, WorldPlace] = {}
         self._frame_index = -1
         self._curves: dict[str, str] = {}
 
@@ -64,11 +65,24 @@ class MosaicLog:
     def follow(self, step: Step) -> None:
         """Note where the targets are in a frame whose place on the mosaic may come to be known."""
         self._frame_index = step.frame.index
-        self._centres = {
-            track.name: track.quad.mean(axis=0, keepdims=True)
-            for track in step.tracks
-            if track.state is TrackState.TRACKING and track.quad is not None
-        }
+        self._places = {track.name: track.world for track in step.tracks if track.world is not None}
+
+    def log_world(self, step: Step) -> None:
+        """Record the camera's view and the targets' paths where no mosaic is made, in world px."""
+        if self._preview_from_world is None:
+            self._preview_from_world = np.eye(3)
+            self._log_styles()
+        self.follow(step)
+        pose = step.camera.world_from_frame
+        if pose is not None:
+            corners = box_quad(0, 0, step.frame.size_wh[0] - 1, step.frame.size_wh[1] - 1)
+            self._log_outline(transform_points(pose, corners))
+        else:
+            self._log_strips(blueprint.MOSAIC_FRAME, np.zeros((0, 5, 2), np.float32))
+        self._log_targets()
+        if self.is_image_due(step.frame.time_s):
+            self._last_image_s = step.frame.time_s
+            self.log_paths()
 
     def is_image_due(self, time_s: float) -> bool:
         """Whether a view of the mosaic would be recorded now, on the source's clock."""
@@ -100,11 +114,16 @@ class MosaicLog:
             self._log_strips(path, _edge_lines(outlines, view, is_loop))
         if view.frame_outline is not None:
             self._log_outline(view.frame_outline)
-        for target in self._paths.values():
-            self._log_strips(
-                target.entities.mosaic_path,
-                _mapped(preview_from_world, target.points(self._outlines)[None]),
-            )
+        self.log_paths()
+
+    def log_paths(self) -> None:
+        """Record where the targets went so far, as it is known now."""
+        preview_from_world = self._preview_from_world
+        if preview_from_world is None:
+            return
+        for target in self._targets.values():
+            path = _thinned(target.place.path)
+            self._log_strips(target.entities.mosaic_path, _mapped(preview_from_world, path[None]))
 
     def log_frame(
         self,
@@ -127,7 +146,7 @@ class MosaicLog:
             corners = box_quad(0, 0, size_wh[0] - 1, size_wh[1] - 1)
             self._log_outline(transform_points(world_from_frame, corners))
             if index == self._frame_index:
-                self._log_targets(world_from_frame)
+                self._log_targets()
         elif has_changed:
             self._log_strips(blueprint.MOSAIC_FRAME, np.zeros((0, 5, 2), np.float32))
         return has_changed
@@ -143,25 +162,35 @@ class MosaicLog:
         _log_styles(self._stream)
         for number, (name, path) in enumerate(self._curves.items()):
             blueprint.log_stage_style(self._stream, path, name, number)
-        for number, (name, target) in enumerate(self._paths.items()):
-            _log_target_styles(self._stream, target.entities, name, number)
+        for name, target in self._targets.items():
+            _log_target_styles(self._stream, target.entities, name, target.number)
 
-    def _log_targets(self, world_from_frame: Matrix) -> None:
-        for name, centre in self._centres.items():
-            if name not in self._paths:
-                self._paths[name] = _Path(TargetEntities.of(name))
-                number = len(self._paths) - 1
-                _log_target_styles(self._stream, self._paths[name].entities, name, number)
-            position = transform_points(world_from_frame, centre)
-            self._paths[name].append(position[0], self._outlines)
+    def _log_targets(self) -> None:
+        for name, place in self._places.items():
+            target = self._target(name, place)
+            target.place, target.is_shown = place, True
             if self._preview_from_world is not None:
-                self._stream.log(
-                    self._paths[name].entities.mosaic_position,
-                    recorded_rows.points(transform_points(self._preview_from_world, position)),
-                )
-        for name in self._paths.keys() - self._centres.keys():
-            nowhere = recorded_rows.points(np.zeros((0, 2), np.float32))
-            self._stream.log(self._paths[name].entities.mosaic_position, nowhere)
+                position = transform_points(self._preview_from_world, place.position)
+                self._stream.log(target.entities.mosaic_position, recorded_rows.points(position))
+        for name, target in self._targets.items():
+            if target.is_shown and name not in self._places:
+                target.is_shown = False
+                nowhere = recorded_rows.points(np.zeros((0, 2), np.float32))
+                self._stream.log(target.entities.mosaic_position, nowhere)
+
+    def _target(self, name: str, place: WorldPlace) -> _Target:
+        """The target's part of the recording, begun when it is first seen in the world."""
+        found = self._targets.pop(name, None)
+        if found is None:
+            found = _Target(TargetEntities.of(name), self._numbers, place)
+            self._numbers += 1
+            _log_target_styles(self._stream, found.entities, name, found.number)
+        self._targets[name] = found  # the last in the order of when they were seen
+        if len(self._targets) > _MOST_TARGETS:
+            first = next(iter(self._targets))
+            gone = self._targets.pop(first)
+            self._log_strips(gone.entities.mosaic_path, np.zeros((0, 2, 2), np.float32))
+        return found
 
     def _log_outline(self, outline: Points) -> None:
         if self._preview_from_world is not None:
@@ -179,60 +208,20 @@ class MosaicLog:
         return self._curves[name]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Anchored:
-    """A point in the unit square of a keyframe, or in the world where ``keyframe`` is -1."""
+@dataclass(slots=True, eq=False)
+class _Target:
+    """A target on the mosaic: where it was last, and with that its path."""
 
-    keyframe: int
-    xy: npt.NDArray[np.float32]
-
-
-class _Path:
-    """Where a target went. Each point is tied to the keyframe next to it, so that the path is
-    moved with the mosaic when that is adjusted. Bounded: a long path loses every second point."""
-
-    def __init__(self, entities: TargetEntities) -> None:
-        self.entities = entities
-        self._points: list[_Anchored] = []
-        self._last = np.full(2, np.inf, np.float32)
-
-    def append(self, position: npt.NDArray[np.float32], outlines: npt.NDArray[np.float32]) -> None:
-        """Add a point (2,) of the world, keyframes lying at ``outlines`` (K, 4, 2)."""
-        if np.hypot(*(position - self._last)) < _MIN_STEP_PX:
-            return
-        self._last = position
-        if len(self._points) >= _MAX_PATH:
-            self._points = self._points[::2]
-        self._points.append(_anchored(position, outlines))
-
-    def points(self, outlines: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """The path (N, 2) in the world as it is now; N is at least 1."""
-        placed = [one for one in self._points if one.keyframe < len(outlines)]
-        result = np.zeros((len(placed), 2), np.float32)
-        keyframes = np.array([one.keyframe for one in placed], int)
-        for keyframe in np.unique(keyframes):
-            rows = np.flatnonzero(keyframes == keyframe)
-            points = np.stack([placed[row].xy for row in rows])
-            if keyframe >= 0:
-                points = transform_points(_from_unit(outlines[keyframe]), points)
-            result[rows] = points
-        return result
+    entities: TargetEntities
+    number: int
+    place: WorldPlace
+    is_shown: bool = False
 
 
-def _anchored(position: npt.NDArray[np.float32], outlines: npt.NDArray[np.float32]) -> _Anchored:
-    """The point tied to the keyframe whose centre is next."""
-    if not len(outlines):
-        return _Anchored(-1, position)
-    keyframe = int(np.argmin(np.linalg.norm(outlines.mean(axis=1) - position, axis=1)))
-    try:
-        unit_from_world = inverted(_from_unit(outlines[keyframe]))
-    except np.linalg.LinAlgError:
-        return _Anchored(-1, position)
-    return _Anchored(keyframe, transform_points(unit_from_world, position[None])[0])
-
-
-def _from_unit(outline: npt.NDArray[np.float32]) -> Matrix:
-    return quad_mapping(_UNIT_SQUARE, outline)
+def _thinned(path: Points) -> Points:
+    """At most `_MAX_PATH` points of a path (N, 2), the last among them."""
+    step = -(-len(path) // _MAX_PATH)
+    return path[(len(path) - 1) % step :: step] if step > 1 else path
 
 
 def _mapped(b_from_a: Matrix, lines: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

@@ -20,8 +20,9 @@ from streamtrack import blueprint, recorded_rows
 from streamtrack.errors import OutputError
 from streamtrack.recorded_mosaic import MosaicLog
 from streamtrack.recorded_target import TargetLog
+from streamtrack.recorded_tracks import TracksTable
 from streamtrack.recorded_video import Clock, Video, without_video
-from streamtrack.settings import Settings
+from streamtrack.settings import Settings, WorldSettings
 from streamtrack.types import (
     Frame,
     Image,
@@ -52,6 +53,7 @@ class StepLog:
         settings: Settings,
         target_names: Sequence[str],
         templates: Mapping[str, Image],
+        world: blueprint.World,
     ) -> None:
         self.frames = 0
         self.picture_bytes = 0
@@ -66,6 +68,8 @@ class StepLog:
         self._target_count = len(target_names)
         self._targets: dict[str, TargetLog] = {}
         self._mosaic = MosaicLog(stream)
+        self._world = world
+        self._table = TracksTable(stream, settings.world != WorldSettings())
         self._has_points = False
         self._stages: dict[str, str] = {}
         self._last_stages: set[str] = set()
@@ -88,6 +92,7 @@ class StepLog:
             blueprint.log_stage_style(self._stream, path, stage, number)
         self.video.begin()
         self._mosaic.begin()
+        self._table.begin()
         self._has_points = False
         if self._source_state:
             self._clock.set(*self.last_frame)
@@ -117,7 +122,11 @@ class StepLog:
             if message:
                 self.log_line(_level_of(track.state), message)
         self._log_times(step)
-        self._mosaic.follow(step)
+        self._table.follow(step)
+        if self._world is blueprint.World.PATHS:
+            self._mosaic.log_world(step)
+        else:
+            self._mosaic.follow(step)
         self.frames += 1
 
     def log_text(self, level: str, message: str) -> None:
@@ -177,6 +186,7 @@ class StepLog:
         self.video.close()
         self._clock.set(*self.last_frame)
         self._mosaic.log_last_view()
+        self._mosaic.log_paths()
         self._log_end(summary_markdown)
 
     def _log_end(self, summary_markdown: str) -> None:

@@ -82,8 +82,9 @@ class Recorder:
         self._series = None if self._rotate is None else FileSeries(path)
         self.path = path if self._series is None else self._series.next_path()
 
+        world = blueprint.world_shown(settings, has_mosaic)
         layout = blueprint.build(
-            source.size_wh, target_names, timeline_of(source), has_mosaic, source.is_live
+            source.size_wh, target_names, timeline_of(source), world, source.is_live
         )
         self._stream = new_stream()
         self._files = RecordingFiles(self._stream, layout)
@@ -91,7 +92,7 @@ class Recorder:
         has_parts = self._series is not None
         self._files.open(self.path)
         self._steps = StepLog(
-            self._stream, clock, source, settings, target_names, template_views or {}
+            self._stream, clock, source, settings, target_names, template_views or {}, world
         )
         self._handler = RunLogHandler(self.log_text)
         self._handler.attach()

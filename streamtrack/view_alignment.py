@@ -120,13 +120,15 @@ def align(
     return _judged(reference, view, fitted)
 
 
-def align_exactly(reference: ReferenceView, view: ViewLevels, guess: Matrix) -> ViewAlignment:
+def align_exactly(
+    reference: ReferenceView, view: ViewLevels, guess: Matrix, hidden: Sequence[Points] = ()
+) -> ViewAlignment:
     """As `align`, from a guess that is right to a pixel or two: more pixels, full resolution."""
     try:
         start = geometry.inverted(guess)
     except np.linalg.LinAlgError:
         return _refusal(Verdict.MIRRORED)
-    fitted = _fit(reference, view, EXACT, start, ())
+    fitted = _fit(reference, view, EXACT, start, hidden)
     return (
         _refusal(Verdict.TOO_FEW_FEATURES) if fitted is None else _judged(reference, view, fitted)
     )

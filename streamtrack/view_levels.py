@@ -105,7 +105,7 @@ class ReferenceView:
         """``hidden`` are quads (4, 2) in the view that do not belong to the scene."""
         self.levels = levels
         self.size_wh = levels.size_wh
-        self._hidden = tuple(hidden)
+        self.hidden = tuple(hidden)
         self._pixels: dict[int, Pixels] = {}
 
     @property
@@ -116,7 +116,7 @@ class ReferenceView:
     def pixels(self, level: int) -> Pixels:
         """The chosen pixels of a level, chosen when first asked for."""
         if level not in self._pixels:
-            self._pixels[level] = _choose_pixels(self.levels, level, self._hidden)
+            self._pixels[level] = _choose_pixels(self.levels, level, self.hidden)
         return self._pixels[level]
 
 

@@ -7,6 +7,7 @@ then move with them, so that a path stays whole and no speed jumps.
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -74,6 +75,7 @@ class WorldPath:
 
     def __init__(self, graph: PoseGraph | None) -> None:
         self._graph = graph
+        self._lock = threading.Lock()  # displays read paths in threads of their own
         self._revision = 0 if graph is None else graph.revision
         self._count = 0
         self._frames = np.zeros(64, np.int64)
@@ -83,14 +85,15 @@ class WorldPath:
 
     def add(self, frame: Frame, in_frame: Doubles, position: Doubles) -> None:
         """Add the position (2,) in a frame and in the world."""
-        if self._count == _MOST_POINTS:
-            self._thin()
-        elif self._count == len(self._frames):
-            self._grow()
-        row = self._count
-        self._frames[row], self._times_s[row] = frame.index, frame.time_s
-        self._in_frame[row], self._positions[row] = in_frame, position
-        self._count += 1
+        with self._lock:
+            if self._count == _MOST_POINTS:
+                self._thin()
+            elif self._count == len(self._frames):
+                self._grow()
+            row = self._count
+            self._frames[row], self._times_s[row] = frame.index, frame.time_s
+            self._in_frame[row], self._positions[row] = in_frame, position
+            self._count += 1
 
     def _columns(self) -> dict[str, npt.NDArray[np.generic]]:
         names = ("_frames", "_times_s", "_in_frame", "_positions")
@@ -107,13 +110,15 @@ class WorldPath:
 
     def points(self, last_frame: int) -> Points:
         """Positions (N, 2) up to a frame, where they lie by what is known now."""
-        self._follow_keyframes()
-        count = int(np.searchsorted(self._frames[: self._count], last_frame, side="right"))
-        return self._positions[:count].astype(np.float32)
+        with self._lock:
+            self._follow_keyframes()
+            count = int(np.searchsorted(self._frames[: self._count], last_frame, side="right"))
+            return self._positions[:count].astype(np.float32)
 
     def recent(self) -> tuple[Doubles, Doubles]:
         """Times (N,) and positions (N, 2) of the last moments, as far as they are used."""
-        self._follow_keyframes()
+        with self._lock:
+            self._follow_keyframes()
         times = self._times_s[: self._count]
         first = int(np.searchsorted(times, times[-1] - _WINDOW_S - 1e-9))
         if self._count - first < _LEAST_IN_WINDOW:

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import ClassVar
+
 import cv2
 import numpy as np
 import pytest
@@ -20,7 +23,8 @@ from streamtrack.mosaic.types import (
 from streamtrack.recorded_pictures import record_picture_mosaic
 from streamtrack.recording import Recorder
 from streamtrack.settings import Settings, build_settings
-from streamtrack.types import Features, Matches, Model, Registration, Verdict
+from streamtrack.types import CameraPose, Features, Matches, Model, Registration, Verdict
+from streamtrack.world import WorldMotion, crossing
 
 STRIPS = "LineStrips2D:strips"
 FRAME = box_quad(0, 0, SIZE[0] - 1, SIZE[1] - 1)
@@ -46,8 +50,31 @@ def preview_from_world():
     return np.linalg.inv(translation(-10, -20) @ scaling(2.0))
 
 
-def log_mosaic(recorder, index, view=None, is_placed=True):
-    recorder.log(step_of(index, lost=range(30, 40)))
+class Graph:
+    """Poses of which all since frame 1 are found to lie ``shift`` px further."""
+
+    keyframes: ClassVar = {}
+    edges = ()
+
+    def __init__(self):
+        self.revision, self.shift = 0, 0.0
+
+    def world_from_frame(self, index):
+        return translation(self.shift, self.shift) @ pose(index)
+
+    def move(self, shift):
+        self.revision += shift != self.shift
+        self.shift = shift
+
+
+def in_world(step, world, is_placed):
+    known = CameraPose(pose(step.frame.index)) if is_placed else CameraPose(None, reason="lost")
+    return world.placed(replace(step, camera=known))
+
+
+def log_mosaic(recorder, index, view=None, is_placed=True, world=None):
+    step = step_of(index, lost=range(30, 40))
+    recorder.log(in_world(step, world or WorldMotion(), is_placed))
     recorder.log_mosaic_frame(
         index,
         index / 25,
@@ -68,13 +95,17 @@ def recorded(tmp_path_factory):
         KeyframeEdge(90, 7, 40, 0.6, True),
         KeyframeEdge(7, 8, 40, 0.6, True),  # a keyframe that is not shown
     )
+    graph = Graph()
+    world = WorldMotion(graph)
     with Recorder(path, source(), Settings(), ["board"], has_mosaic=True) as recorder:
         for index in range(60):
+            graph.move(40.0 if index >= 50 else 0.0)
             log_mosaic(
                 recorder,
                 index,
-                mosaic_view(400, 40.0 if index >= 50 else 0.0, edges, (7, 90)),
+                mosaic_view(400, graph.shift, edges, (7, 90)),
                 is_placed=not 10 <= index < 15,
+                world=world,
             )
     return path
 
@@ -124,17 +155,47 @@ def test_paths_follow_the_targets_and_the_adjusted_keyframes(recorded):
     paths = dict(zip(frames, paths, strict=True))
     seen = [index for index in range(26) if not 10 <= index < 15]
     centres = [
-        transform_points(pose(index), tracked("board", index).quad.mean(axis=0)[None])[0]
-        for index in seen
+        transform_points(pose(index), crossing(tracked("board", index).quad))[0] for index in seen
     ]
     expected = transform_points(preview_from_world(), centres)
     np.testing.assert_allclose(paths[25][0], expected, atol=0.01)
     moved = np.array(paths[50][0])[: len(expected)]
-    np.testing.assert_allclose(moved[1:], expected[1:] + 20.0, atol=0.01)  # 40 px at half size
+    np.testing.assert_allclose(moved, expected + 20.0, atol=0.01)  # 40 px at half size
     frames, places = rrd_columns(recorded, "/mosaic/targets/board/position", "Points2D:positions")
     places = dict(zip(frames, places, strict=True))
     np.testing.assert_allclose(places[20][0], expected[seen.index(20)], atol=0.01)
     assert places[30] == []
+
+
+def test_the_table_of_tracks_says_where_they_are(recorded):
+    frames, tables = rrd_columns(recorded, "/tracks", "TextDocument:text")
+    tables = dict(zip(frames, (text for (text,) in tables), strict=True))
+    assert frames[0] == 0 and 26 in frames
+    x, y = transform_points(pose(26), crossing(tracked("board", 26).quad))[0]
+    assert f"| board | tracking | {x:.0f}, {y:.0f} |" in tables[26]
+    lost = next(tables[frame] for frame in frames if 30 <= frame < 40)
+    assert "| board | lost | - | - |" in lost
+
+
+def test_without_a_mosaic_a_moving_camera_has_its_paths(tmp_path):
+    path, world = tmp_path / "paths.rrd", WorldMotion()
+    with Recorder(path, source(), build_settings({"camera": "auto"}), ["board"]) as recorder:
+        for index in range(40):
+            recorder.log(in_world(step_of(index, lost=()), world, index != 20))
+    frames, outlines = rrd_columns(path, "/mosaic/frame", STRIPS)
+    outlines = dict(zip(frames, outlines, strict=True))
+    np.testing.assert_allclose(outlines[30][0][:4], transform_points(pose(30), FRAME), atol=1e-3)
+    assert outlines[20] == []
+    paths = rrd_columns(path, "/mosaic/targets/board/path", STRIPS)[1]
+    assert len(paths[-1][0]) == 39
+    assert rrd_columns(path, "/mosaic/image", BLOB)[0] == []
+
+
+def test_a_fixed_camera_needs_no_second_view(tmp_path):
+    path, world = tmp_path / "fixed.rrd", WorldMotion()
+    with Recorder(path, source(), Settings(), ["board"]) as recorder:
+        recorder.log(in_world(step_of(0, lost=()), world, True))
+    assert not any(name.startswith("/mosaic") for name in rrd_entities(path))
 
 
 def test_states_and_their_reasons(recorded):

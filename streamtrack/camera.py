@@ -40,6 +40,7 @@ _MAX_AREA_JUMP = 1.5
 _MAX_STRETCH = 4.0
 _MAX_STEPS_AHEAD = 8
 _REFERENCES_KEPT = 6
+_MARGIN_PX = 8.0  # of the usual level, around the targets
 
 
 class CameraEstimator(Protocol):
@@ -101,7 +102,7 @@ class MovingCamera:
         """The camera's pose in the next frame; targets' quads are left out of account."""
         self._loops.advance()
         levels = ViewLevels(view.grey)
-        hidden = [track.quad for track in tracks if track.quad is not None]
+        hidden = _outlines(tracks, levels)
         state = self._state
         if state is None:
             return self._begin(view, levels, hidden)
@@ -295,6 +296,12 @@ class MovingCamera:
         self._references[keyframe] = reference
         while len(self._references) > _REFERENCES_KEPT:
             del self._references[next(iter(self._references))]
+
+
+def _outlines(tracks: Sequence[Track], levels: ViewLevels) -> list[Points]:
+    """The targets' quads with a margin: what moves tinges the local means of what is next to it."""
+    margin_px = _MARGIN_PX * levels.size_wh[0] / levels.usual.shape[1]
+    return [geometry.grown_quad(t.quad, margin_px) for t in tracks if t.quad is not None]
 
 
 def _refused(found: ViewAlignment) -> CameraPose:

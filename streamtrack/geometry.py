@@ -128,6 +128,22 @@ def _corner_list(quad: npt.ArrayLike) -> list[Any]:
     return list(np.asarray(quad, np.float64).reshape(-1, 2).tolist())
 
 
+def grown_quad(quad: npt.ArrayLike, margin: float) -> Points:
+    """The quad (4, 2) with each side moved outwards by ``margin``; as it is if it is not convex."""
+    corners = np.asarray(quad, np.float64).reshape(4, 2)
+    area = signed_area(corners)
+    if not is_convex(corners) or not isfinite(area):
+        return corners.astype(np.float32)
+    along = np.roll(corners, -1, axis=0) - corners
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    outward = np.stack([along[:, 1], -along[:, 0]], axis=1) * (1.0 if area > 0 else -1.0)
+    before = np.roll(outward, 1, axis=0)
+    # At a corner both sides move: along the bisector, farther the sharper it is, within reason.
+    together = 1.0 + np.sum(outward * before, axis=1, keepdims=True)
+    moved = corners + margin * (outward + before) / np.maximum(together, 0.25)
+    return np.asarray(moved, np.float32)
+
+
 def signed_area(quad: npt.ArrayLike) -> float:
     """Area of a polygon (N, 2) in px^2; positive when clockwise on the screen (y down)."""
     corners = _corner_list(quad)

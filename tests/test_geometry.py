@@ -211,3 +211,17 @@ def test_grey_is_grey() -> None:
     grey = np.arange(12, dtype=np.uint8).reshape(3, 4)
     assert geometry.grey_of(grey) is grey
     np.testing.assert_array_equal(geometry.grey_of(np.dstack([grey] * 3)), grey)
+
+
+@pytest.mark.parametrize("is_turned", [False, True])
+def test_a_grown_quad_has_its_sides_further_out(is_turned: bool) -> None:
+    quad = geometry.box_quad(10, 20, 200, 30)
+    wanted = geometry.box_quad(4, 14, 212, 42)
+    if is_turned:
+        quad, wanted = quad[::-1], wanted[::-1]
+    np.testing.assert_allclose(geometry.grown_quad(quad, 6), wanted, atol=1e-4)
+
+
+def test_a_quad_that_is_not_convex_is_not_grown() -> None:
+    crossed = np.array([[0, 0], [10, 10], [10, 0], [0, 10]], np.float32)
+    np.testing.assert_array_equal(geometry.grown_quad(crossed, 5), crossed)

@@ -111,14 +111,15 @@ class Chooser:
         self._size_wh = size_wh
         self._samples: list[Image] = []
         self._is_primary: list[bool] = []
+        self._moments: list[int] = []
         self._small = np.zeros((0, size_wh[1] // 4 + _GAP, size_wh[0] // 4, 4), np.uint8)
         self._differs: dict[tuple[int, int], Mask] = {}
 
     def __len__(self) -> int:
         return len(self._samples)
 
-    def add(self, pixels: Image, is_primary: bool = True) -> None:
-        """Compare a sample with all before it; one without any weight is left out.
+    def add(self, pixels: Image, is_primary: bool = True, moment: int | None = None) -> None:
+        """Compare a sample, taken at a moment, with all before; one without weight is left out.
 
         One that is not primary votes as the others do, but its pixels stand back behind theirs.
         """
@@ -135,6 +136,7 @@ class Chooser:
         self._small[count] = small
         self._samples.append(pixels)
         self._is_primary.append(is_primary)
+        self._moments.append(count if moment is None else moment)
 
     def _compare(self, small: Image, count: int) -> None:
         """The samples before are one tall picture, a gap below each: a few calls for all."""
@@ -157,7 +159,7 @@ class Chooser:
         overlap = int(np.count_nonzero(times > 1)) * 16
         if not self._differs:
             return Choice(tuple(self._samples), tuple(weights), Tally(overlap))
-        votes = vote(self._small[: len(self), :-_GAP], self._differs)
+        votes = vote(self._small[: len(self), :-_GAP], self._differs, self._moments)
         judged = [
             self._shut_out(weight, outlier) if outlier.any() else weight
             for weight, outlier in zip(weights, votes.outliers, strict=True)

@@ -63,7 +63,7 @@ class Renderer:
             x0, y0, x1, y1 = reach
             if x0 < box[2] and x1 > box[0] and y0 < box[3] and y1 > box[1]:
                 is_primary = primary is None or view.number in primary
-                chooser.add(self._warped(view, reach, box), is_primary)
+                chooser.add(self._warped(view, reach, box), is_primary, view.moment)
                 yield
 
     def remember(self, view: View, pixels: Image) -> None:

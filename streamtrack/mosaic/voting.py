@@ -2,14 +2,14 @@
 
 The sample that most others agree with leads; of equals, the oldest. Where a vote is close (two
 samples that disagree, or a thing that stood there for about half of the time) the outlines tell:
-a thing that lies on the ground has edges where the difference of the two samples has its own, the
-bare ground has none there. After the test for removed objects in video surveillance (Connell et
-al., "Detection and tracking in the IBM PeopleVision system", ICME 2004), made pairwise.
+a thing that lies on the ground ends at its outline, in colour and in edges, and the ground goes on.
+After the test for removed objects in video surveillance (Connell et al., "Detection and tracking in
+the IBM PeopleVision system", ICME 2004), made pairwise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -21,11 +21,17 @@ from streamtrack.types import Image, Mask
 
 _CALM = 9
 _CLOSE_VOTE = 0.6
+_MOST_SPAN = 4.0
 _CLEARLY = 1.15
-_RIM_LEVELS = 14.0
+_AROUND_LEVELS = 16.0
+_LEAST_AROUND = 12
+_LEAST_STEP = 6.0
+_NEAR = (7, 7)
+_LEAST_NEAR = 0.12
 _LEAST_CELLS = 16
+_EDGE = 4  # cells around a dispute that are looked at
 _MOST_DISPUTES = 12
-_KERNEL_3 = np.ones((3, 3), np.uint8)
+_KERNEL_3, _KERNEL_7 = (np.ones((side, side), np.uint8) for side in (3, 7))
 
 Floats: TypeAlias = npt.NDArray[np.float32]
 Differs: TypeAlias = Mapping[tuple[int, int], Mask]
@@ -43,18 +49,20 @@ class Votes:
     undecided: int
 
 
-def vote(samples: Image, differs: Differs) -> Votes:
-    """Judge BGRW samples (n, h, w, 4), oldest first.
+def vote(samples: Image, differs: Differs, moments: Sequence[int]) -> Votes:
+    """Judge BGRW samples (n, h, w, 4), oldest first, taken at ``moments`` (n,).
 
     ``differs`` has, for pairs (a, b) with a < b that disagree anywhere, where they do (h, w).
+    A sample's vote counts for the time between its neighbours.
     """
     covered = samples[..., 3] > 0
-    times = covered.sum(axis=0, dtype=np.int16)
+    spans = _spans(moments)
+    times = np.tensordot(spans, covered.astype(np.float32), axes=1)
     support = np.where(covered, times[None], 0).astype(np.float32)
     contested = np.zeros(times.shape, np.bool_)
     for (a, b), mask in differs.items():
-        support[a][mask] -= 1
-        support[b][mask] -= 1
+        support[a][mask] -= spans[b]
+        support[b][mask] -= spans[a]
         contested |= mask
     # Averaged, so that one sample leads in all of a place.
     smooth = np.stack([cv2.blur(votes, (_CALM, _CALM)) for votes in support])
@@ -65,8 +73,21 @@ def vote(samples: Image, differs: Differs) -> Votes:
     for (a, b), mask in differs.items():
         outliers[b] |= mask & (leader == a)
         outliers[a] |= mask & (leader == b)
-    undecided = contested & (2 * support.max(axis=0) <= times)
+    undecided = contested & (2 * support.max(axis=0) <= 1.001 * times)
     return Votes(outliers, int(np.count_nonzero(contested)), int(np.count_nonzero(undecided)))
+
+
+def _spans(moments: Sequence[int]) -> Floats:
+    """The time (n,) that each sample stands for, a mean of 1; none for very much or little."""
+    if len(moments) < 3:
+        return np.ones(len(moments), np.float32)
+    gaps = np.diff(np.asarray(moments, np.float64))
+    spans = 0.5 * (np.append(gaps, gaps[-1]) + np.append(gaps[0], gaps))
+    usual = float(np.median(spans))
+    if usual <= 0:
+        return np.ones(len(moments), np.float32)
+    spans = np.clip(spans, usual / _MOST_SPAN, usual * _MOST_SPAN)
+    return np.asarray(spans / spans.mean(), np.float32)
 
 
 def _settle_close_votes(
@@ -83,7 +104,8 @@ def _settle_close_votes(
             for roi, inside in _parts(mask & seen & is_first & (leader == first)):
                 votes, votes_first = (np.median(support[n][roi][inside]) for n in (rival, first))
                 is_close = votes >= _CLOSE_VOTE * votes_first
-                if is_close and _is_ground(samples[rival][roi], samples[first][roi], inside):
+                pair = samples[rival][roi], samples[first][roi]
+                if is_close and _is_ground(*pair, inside, mask[roi]):
                     leader[roi][inside] = rival
 
 
@@ -95,28 +117,53 @@ def _parts(mask: Mask) -> Iterator[tuple[tuple[slice, slice], Mask]]:
         x, y, width, height, size = stats[part].tolist()
         if size < _LEAST_CELLS:
             break
-        roi = slice(max(y - 1, 0), y + height + 1), slice(max(x - 1, 0), x + width + 1)
+        rows = slice(max(y - _EDGE, 0), y + height + _EDGE)
+        roi = rows, slice(max(x - _EDGE, 0), x + width + _EDGE)
         yield roi, np.asarray(parts[roi] == part)
 
 
-def _is_ground(one: Image, other: Image, inside: Mask) -> bool:
+def _is_ground(one: Image, other: Image, inside: Mask, disputed: Mask) -> bool:
     """Whether ``one`` shows the ground where ``other`` shows a thing on it (BGRW, h, w, 4).
 
-    They must agree all around, else the difference is one of light or of poses; and what is inside
-    must have clearly less outline, against its own brightness.
+    ``inside`` is a part of the cells that are ``disputed``. Around it they must agree, else the
+    difference is one of light or of poses. Then the ground goes on across the outline, in colour
+    and in edges, and a thing does not.
     """
-    core = cv2.erode(inside.view(np.uint8), _KERNEL_3)
-    rim = inside & (core == 0)
-    differs = cv2.absdiff(one, other)[..., :3].max(axis=2)
-    if not rim.any() or float(np.percentile(differs[rim], 80)) > _RIM_LEVELS:
+    around = cv2.dilate(inside.view(np.uint8), _KERNEL_7) > 0
+    around &= ~disputed & (one[..., 3] > 0) & (other[..., 3] > 0)
+    differs = cv2.blur(cv2.absdiff(one, other), (3, 3))[..., :3].max(axis=2)
+    if np.count_nonzero(around) < _LEAST_AROUND:
         return False
-    grey, grey_other = (cv2.cvtColor(p, cv2.COLOR_BGRA2GRAY) for p in (one, other))
-    weight = np.where(inside, _edges(cv2.absdiff(grey, grey_other)), 0.0)
-    outline, outline_other = (
-        float(np.sum(_edges(p) * weight)) / (1.0 + float(p[inside].mean()))
-        for p in (grey, grey_other)
-    )
-    return outline_other > _CLEARLY * outline
+    if float(np.percentile(differs[around], 60)) > _AROUND_LEVELS:
+        return False
+    core = inside & (differs > _AROUND_LEVELS)
+    step, step_other = (_step_across(p, core, around) for p in (one, other))
+    if max(step, step_other) < _LEAST_STEP:
+        return _outline(other, one, core) > _CLEARLY * _outline(one, other, core)
+    return step_other > _CLEARLY * step
+
+
+def _step_across(picture: Image, core: Mask, around: Mask) -> float:
+    """Mean difference of colour between the two sides of an outline, in grey levels."""
+    colours = picture[..., :3].astype(np.float32)
+    means, is_near = [], []
+    for side in (core, around):
+        share = cv2.blur(side.astype(np.float32), _NEAR)
+        total = cv2.blur(colours * side[..., None].astype(np.float32), _NEAR)
+        means.append(total / np.maximum(share, 1e-6)[..., None])
+        is_near.append(share > _LEAST_NEAR)
+    both = is_near[0] & is_near[1]
+    if not both.any():
+        return 0.0
+    return float(np.abs(means[0] - means[1])[both].max(axis=1).mean())
+
+
+def _outline(picture: Image, rival: Image, inside: Mask) -> float:
+    """Edges where the difference from the rival has its own, against the brightness there."""
+    grey, grey_rival = (cv2.cvtColor(p, cv2.COLOR_BGRA2GRAY) for p in (picture, rival))
+    weight = np.where(inside, _edges(cv2.absdiff(grey, grey_rival)), 0.0)
+    brightness = float(grey[inside].mean()) if inside.any() else 0.0
+    return float(np.sum(_edges(grey) * weight)) / (1.0 + brightness)
 
 
 def _edges(grey: npt.NDArray[np.generic]) -> Floats:

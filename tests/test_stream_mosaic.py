@@ -149,6 +149,26 @@ def test_what_passes_by_leaves_no_ghost(
     assert exported.tally.contested > 1000
 
 
+@pytest.mark.parametrize("stay", [(0, 60), (60, 120), (30, 90)])
+def test_a_textured_thing_that_stays_for_half_of_the_time_is_not_the_ground(
+    tmp_path: Path, make_picture: MakePicture, stay: tuple[int, int]
+) -> None:
+    """It comes along, stands there and goes on; the ground has as much texture as it has."""
+    ground = cv2.cvtColor(make_picture(12, (320, 240)), cv2.COLOR_GRAY2BGR)
+    thing = cv2.cvtColor(make_picture(13, (80, 70)), cv2.COLOR_GRAY2BGR) // 2
+    thing += np.array([70, 20, 5], np.uint8)
+    with StreamMosaic(settings()) as mosaic:
+        for number in range(120):
+            away = min(0, number - stay[0]) + max(0, number - stay[1] + 1)
+            left, image = 120 + 12 * away, ground.copy()
+            part = thing[:, max(0, -left) : max(0, 320 - left)]
+            image[80:150, max(0, left) : max(0, left) + part.shape[1]] = part
+            assert mosaic.add(Frame(number, number / 30, image), at(0, 0)) == ""
+        mosaic.finish(tmp_path / "m.png")
+    error = cv2.absdiff(read(tmp_path / "m.png")[..., :3], ground).max(axis=2)
+    assert np.mean(cv2.blur(error, (5, 5))[80:150, 120:200] > 25) < 0.08
+
+
 def test_targets_are_not_painted(tmp_path: Path, make_picture: MakePicture) -> None:
     """Not even one that is in every frame, as long as the camera or the target moves."""
     land = make_picture(13, (400, 120))

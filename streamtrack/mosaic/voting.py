@@ -22,7 +22,7 @@ from streamtrack.types import Image, Mask
 _CALM = 9
 _CLOSE_VOTE = 0.6
 _MOST_SPAN = 4.0
-_CLEARLY = 1.15
+_CLEARLY, _VERY_CLEARLY = 1.15, 1.4
 _AROUND_LEVELS = 16.0
 _LEAST_AROUND = 12
 _LEAST_STEP = 6.0
@@ -100,13 +100,33 @@ def _settle_close_votes(
         rivals = [a + b - first for a, b in differs if first in (a, b)]
         for rival in sorted(rivals, key=lambda number: -float(support[number][is_first].sum())):
             mask = differs[min(first, rival), max(first, rival)]
-            seen = (support[first] > 0) & (support[rival] > 0)
-            for roi, inside in _parts(mask & seen & is_first & (leader == first)):
-                votes, votes_first = (np.median(support[n][roi][inside]) for n in (rival, first))
-                is_close = votes >= _CLOSE_VOTE * votes_first
-                pair = samples[rival][roi], samples[first][roi]
-                if is_close and _is_ground(*pair, inside, mask[roi]):
-                    leader[roi][inside] = rival
+            seen = mask & (support[first] > 0) & (support[rival] > 0)
+            if not (seen & is_first & (leader == first)).any():
+                continue
+            pair, votes = (samples[rival], samples[first]), (support[rival], support[first])
+            # A thing may have several leaders: a part of it is judged with the whole as well.
+            for roi, part in _parts(seen & is_first & (leader == first)):
+                if _is_won(pair, votes, roi, part, mask, _CLEARLY):
+                    leader[roi][part] = rival
+            for roi, whole in _parts(seen):
+                led = whole & is_first[roi] & (leader[roi] == first)
+                if led.any() and _is_won(pair, votes, roi, whole, mask, _VERY_CLEARLY):
+                    leader[roi][led] = rival
+
+
+def _is_won(
+    pair: tuple[Image, Image],
+    votes: tuple[Floats, Floats],
+    roi: tuple[slice, slice],
+    inside: Mask,
+    disputed: Mask,
+    clearly: float,
+) -> bool:
+    """Whether the first of a pair has nearly as many votes in a part, and shows the ground."""
+    one, other = (float(np.median(some[roi][inside])) for some in votes)
+    if one < _CLOSE_VOTE * other:
+        return False
+    return _is_ground(pair[0][roi], pair[1][roi], inside, disputed[roi], clearly)
 
 
 def _parts(mask: Mask) -> Iterator[tuple[tuple[slice, slice], Mask]]:
@@ -122,7 +142,7 @@ def _parts(mask: Mask) -> Iterator[tuple[tuple[slice, slice], Mask]]:
         yield roi, np.asarray(parts[roi] == part)
 
 
-def _is_ground(one: Image, other: Image, inside: Mask, disputed: Mask) -> bool:
+def _is_ground(one: Image, other: Image, inside: Mask, disputed: Mask, clearly: float) -> bool:
     """Whether ``one`` shows the ground where ``other`` shows a thing on it (BGRW, h, w, 4).
 
     ``inside`` is a part of the cells that are ``disputed``. Around it they must agree, else the
@@ -139,8 +159,8 @@ def _is_ground(one: Image, other: Image, inside: Mask, disputed: Mask) -> bool:
     core = inside & (differs > _AROUND_LEVELS)
     step, step_other = (_step_across(p, core, around) for p in (one, other))
     if max(step, step_other) < _LEAST_STEP:
-        return _outline(other, one, core) > _CLEARLY * _outline(one, other, core)
-    return step_other > _CLEARLY * step
+        return _outline(other, one, core) > clearly * _outline(one, other, core)
+    return step_other > clearly * step
 
 
 def _step_across(picture: Image, core: Mask, around: Mask) -> float:

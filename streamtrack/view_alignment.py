@@ -39,6 +39,9 @@ _PERSPECTIVE_SIGMA = 0.05  # of the change against the guess, in units of half a
 _SHAPE_SIGMA = 0.15
 _MIN_CELLS = 6
 _MIN_AGREEING_SHARE = 0.3
+_MIN_SHAPE_SHARE = 0.6  # of agreeing cells, for a mapping richer than a similarity
+_MIN_STIFF_SHARE = 0.85  # of its agreeing cells that a similarity must keep
+_MAX_STIFF_UNLIKE = 1.25  # and the factor by which they may be less alike
 _MIN_SPREAD_SHARE = 0.08
 _MIN_CELL_CORRELATION = 0.5
 _MIN_CORRELATION = 0.6
@@ -117,7 +120,7 @@ def align(
             return _refusal(Verdict.TOO_FEW_FEATURES if level == USUAL else Verdict.OUT_OF_VIEW)
         view_from_reference = fitted.view_from_reference
     assert fitted is not None
-    return _judged(reference, view, fitted)
+    return _stiffened(reference, view, start, fitted, hidden)
 
 
 def align_exactly(
@@ -129,9 +132,36 @@ def align_exactly(
     except np.linalg.LinAlgError:
         return _refusal(Verdict.MIRRORED)
     fitted = _fit(reference, view, EXACT, start, hidden)
-    return (
-        _refusal(Verdict.TOO_FEW_FEATURES) if fitted is None else _judged(reference, view, fitted)
+    if fitted is None:
+        return _refusal(Verdict.TOO_FEW_FEATURES)
+    return _stiffened(reference, view, start, fitted, hidden)
+
+
+def _stiffened(
+    reference: ReferenceView,
+    view: ViewLevels,
+    start: Matrix,
+    fitted: _Fitted,
+    hidden: Sequence[Points],
+) -> ViewAlignment:
+    """The fit judged, or a similarity change of ``start`` where much of the view disagrees.
+
+    What moves by itself (water, a herd) then cannot shear or tilt the rest.
+    """
+    found = _judged(reference, view, fitted)
+    agrees = found.inliers >= _MIN_SHAPE_SHARE * len(found.is_inlier)
+    if found.verdict is not Verdict.OK or agrees:
+        return found
+    middle = geometry.image_quad(reference.size_wh).mean(axis=0, keepdims=True)
+    before, after = (
+        geometry.transform_points(m, middle)[0] for m in (start, fitted.view_from_reference)
     )
+    near = geometry.translation(*(after - before).tolist()) @ start
+    poorer = _fit(reference, view, fitted.level, near, hidden, _SIMILARITY)
+    stiff = found if poorer is None else _judged(reference, view, poorer)
+    is_as_good = stiff.inliers >= _MIN_STIFF_SHARE * found.inliers
+    is_as_good &= 1 - stiff.correlation <= _MAX_STIFF_UNLIKE * (1 - found.correlation)
+    return stiff if stiff.verdict is Verdict.OK and is_as_good else found
 
 
 def _refusal(verdict: Verdict) -> ViewAlignment:
@@ -183,6 +213,7 @@ class _Fitted:
     pixels: Pixels
     seen: Floats
     residual: Floats
+    basis: Doubles
     normal: Doubles
     is_settled: bool
 
@@ -193,6 +224,7 @@ def _fit(
     level: int,
     start: Matrix,
     hidden: Sequence[Points],
+    basis: Doubles | None = None,
 ) -> _Fitted | None:
     """Gauss-Newton at one level from ``start`` (view_from_reference), or None."""
     values = view.high_passed(level)
@@ -202,7 +234,7 @@ def _fit(
     pixels = _in_view(reference.pixels(level), mapping, values.shape, outlines)
     if len(pixels.values) < _LEAST_PIXELS[level]:
         return None
-    basis = _FREEDOMS[level]
+    basis = _FREEDOMS[level] if basis is None else basis
     is_full = basis.shape[1] == 8
     jacobian = pixels.jacobian if is_full else pixels.jacobian @ basis.astype(np.float32)
     unit, level_from_unit = pixels.unit_from_level, geometry.inverted(pixels.unit_from_level)
@@ -232,7 +264,9 @@ def _fit(
     if not np.isfinite(found).all() or abs(found[2, 2]) < 1e-9:
         return None
     is_settled = moved_px <= _MAX_LAST_STEP_PX
-    return _Fitted(geometry.normalized(found), level, pixels, seen, residual, normal, is_settled)
+    return _Fitted(
+        geometry.normalized(found), level, pixels, seen, residual, basis, normal, is_settled
+    )
 
 
 def _likeness(
@@ -452,7 +486,7 @@ def _corner_sigma_px(
     rows_x = np.stack([x, y, one, zero, zero, zero, -x * x, -x * y], axis=1)
     rows_y = np.stack([zero, zero, zero, x, y, one, -x * y, -y * y], axis=1)
     try:
-        covariance = np.linalg.inv(fitted.normal)
+        covariance = fitted.basis @ np.linalg.inv(fitted.normal) @ fitted.basis.T
     except np.linalg.LinAlgError:
         return float("inf")
     variance = np.sum(rows_x @ covariance * rows_x + rows_y @ covariance * rows_y, axis=1)

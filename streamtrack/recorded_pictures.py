@@ -24,7 +24,7 @@ from streamtrack import blueprint, recorded_rows
 from streamtrack.errors import OutputError
 from streamtrack.geometry import scaling, transform_points
 from streamtrack.mosaic.types import Link, Picture, Placement, Status
-from streamtrack.recorded_file import RecordingFiles, free_bytes, new_stream
+from streamtrack.recorded_file import RecordingFiles, free_bytes, new_stream, reserve_bytes
 from streamtrack.recorded_video import jpeg_of
 from streamtrack.types import Image, Points, Size, Verdict
 
@@ -34,6 +34,8 @@ _PICTURE_SIDE = 1024
 _PAIR_SIDE = 800
 _PAIR_GAP = 8
 _QUALITY = 85
+_MOST_IMAGE_BYTES = 1_000_000
+_FLUSH_TIMEOUT_S = 30.0
 _MAX_LINKS = 48
 _MAX_LINES = 200
 _LINKS_A_PAGE = 4
@@ -62,6 +64,7 @@ def record_picture_mosaic(
     shown = [link for link in shown if link.a in by_index and link.b in by_index]
     stream = new_stream()
     files = RecordingFiles(stream, _layout(pictures, shown, mosaic))
+    _check_room(path)
     files.open(path)
     try:
         _log_styles(stream)
@@ -69,25 +72,43 @@ def record_picture_mosaic(
         if mosaic is not None:
             _log_mosaic(stream, mosaic, outlines, placements)
         for picture in pictures:
+            _wait_for_room(stream, path)
             _log_picture(stream, picture)
         for link in shown:
+            _wait_for_room(stream, path)
             _log_link(stream, link, by_index[link.a], by_index[link.b])
         _log_lines(stream, placements, links, len(links) - len(shown))
         document = rr.TextDocument(summary_markdown, media_type="text/markdown")
         stream.log(blueprint.SUMMARY, document, static=True)
     finally:
         is_whole = files.close()
-    if not is_whole or _is_full(path):
-        raise OutputError(
-            f"cannot write {path}: no space left on the disk; free some or choose another disk"
-        )
+    if not is_whole:
+        raise _no_room(path)
 
 
-def _is_full(path: Path) -> bool:
+def _check_room(path: Path) -> None:
+    """Raise OutputError while the file can still be ended: on a full disk Rerun waits for ever."""
+    folder = path.resolve().parent
+    while not folder.exists():
+        folder = folder.parent
     try:
-        return free_bytes(path.parent) == 0
+        free = free_bytes(folder)
     except OSError as error:
         raise OutputError(f"recording {path}: {error.strerror or error}") from None
+    if free < reserve_bytes(_MOST_IMAGE_BYTES):
+        raise _no_room(path)
+
+
+def _wait_for_room(stream: rr.RecordingStream, path: Path) -> None:
+    """Let what was logged reach the disk, and see that there is space for more."""
+    stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
+    _check_room(path)
+
+
+def _no_room(path: Path) -> OutputError:
+    return OutputError(
+        f"cannot write {path}: no space left on the disk; free some or choose another disk"
+    )
 
 
 def _log_styles(stream: rr.RecordingStream) -> None:

@@ -10,6 +10,7 @@ from rerun.chunk import RrdReader
 from rrd import rrd_columns, rrd_entities
 from test_recording import BLOB, SIZE, blob, picture, source, step_of, tracked
 
+from streamtrack import recorded_pictures
 from streamtrack.errors import OutputError
 from streamtrack.geometry import box_quad, scaling, transform_points, translation
 from streamtrack.mosaic.types import (
@@ -311,6 +312,19 @@ def test_without_a_mosaic_the_links_say_why(tmp_path):
     entities = set(rrd_entities(path))
     assert "/links/0-1/image" in entities
     assert "/mosaic/image" not in entities
+
+
+def test_a_disk_that_fills_up_is_said_and_the_file_is_closed(tmp_path, monkeypatch):
+    # Rerun waits for ever for a full disk, so the end must come before that.
+    free = iter([10**12, 10**12, 10**12])
+    monkeypatch.setattr(recorded_pictures, "free_bytes", lambda _folder: next(free, 10**6))
+    path = tmp_path / "full.rrd"
+    pictures, placements = pictures_and_placements()
+    with pytest.raises(OutputError, match="no space left"):
+        record_picture_mosaic(path, pictures, [link_of(0, 1)], placements, picture(0), {}, "")
+    entities = set(rrd_entities(path))
+    assert "/pictures/1/image" in entities
+    assert "/pictures/2/image" not in entities
 
 
 def test_an_unwritable_place_is_refused(tmp_path):

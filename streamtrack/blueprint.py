@@ -9,6 +9,7 @@ Entities:
     mosaic/targets/<name>/path, /position                where each target went on the mosaic
     mosaic/state, source/state                           states of the mosaic, of a live source
     metrics/features, metrics/<name>/..., metrics/ms/... curves
+    metrics/found/tracking, /lost                        how many automatic targets there are
     metrics/mosaic/..., metrics/age_ms, metrics/source/...
     tracks                                               table of the targets, as it is now
     summary, log                                         text
@@ -47,6 +48,7 @@ MOSAIC_LOOPS = "mosaic/loops"
 MOSAIC_STATE = "mosaic/state"
 MOSAIC_CURVES = "metrics/mosaic"
 TRACKS = "tracks"
+FOUND_CURVES = "metrics/found"
 SUMMARY = "summary"
 LOG = "log"
 
@@ -406,7 +408,7 @@ def _curve_row(
         active_tab=0,
     )
     return rrb.Horizontal(
-        _curve("Features, matches, inliers", [FEATURE_COUNT, *counts]),
+        _curve("Features, matches, inliers", [FEATURE_COUNT, f"{FOUND_CURVES}/**", *counts]),
         *([agreement] if targets else []),
         _curve("Milliseconds a frame", [f"{TOTAL_MS}/**"]),
         *more,

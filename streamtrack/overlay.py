@@ -35,6 +35,12 @@ def target_color(index: int) -> Color:
     return blue, green, red
 
 
+def _color_of(index: int, track: Track) -> Color:
+    """The target's colour: by its place in the list, or by its number if it was found."""
+    number = track.name.rpartition("-")[2]
+    return target_color(int(number) if track.is_found and number.isdecimal() else index)
+
+
 class Trails:
     """The last ``length`` centres of each tracked target, carried along with a moving camera.
 
@@ -87,7 +93,7 @@ def draw_step(step: Step, *, trail: Mapping[str, npt.ArrayLike] | None = None) -
     picture = _copy_bgr(step.frame.image)
     pen = _pen_for(step.frame.size_wh)
     for index, track in enumerate(step.tracks):
-        color = target_color(index)
+        color = _color_of(index, track)
         _draw_evidence(picture, track, color, pen)
         if trail is not None and track.name in trail:
             _draw_trail(picture, trail[track.name], color, pen)
@@ -95,7 +101,7 @@ def draw_step(step: Step, *, trail: Mapping[str, npt.ArrayLike] | None = None) -
             _draw_quad(picture, track.quad, color, pen)
     for index, track in enumerate(step.tracks):
         if track.quad is not None:
-            _draw_label(picture, track, target_color(index), pen)
+            _draw_label(picture, track, _color_of(index, track), pen)
     _draw_header(picture, step, pen)
     return picture
 
@@ -199,6 +205,8 @@ def _draw_label(picture: Image, track: Track, color: Color, pen: _Pen) -> None:
     if not np.isfinite(track.quad).all():
         return
     tag = f"{track.name}: {track.state.value}" + (f" ({track.means})" if track.means else "")
+    if track.is_found:  # there may be many
+        tag = track.name
     text = _fitted(tag, picture.shape[1] - 2 * _margin(pen), pen)
     (width, height), _ = cv2.getTextSize(text, _FONT, pen.font, 1)
     margin = _margin(pen)
@@ -215,9 +223,9 @@ def _draw_header(picture: Image, step: Step, pen: _Pen) -> None:
     parts = [f"frame {frame.index}", f"{frame.time_s:.3f} s", *([frame.name] if frame.name else [])]
     lines: list[tuple[str, Color]] = [(" | ".join(parts), _WHITE)]
     for index, track in enumerate(step.tracks):
-        if track.state is not TrackState.TRACKING:
+        if track.state is not TrackState.TRACKING and not track.is_found:
             lines.append(
-                (_status(track.name, track.state.value, track.reason), target_color(index))
+                (_status(track.name, track.state.value, track.reason), _color_of(index, track))
             )
     if step.camera.world_from_frame is None:
         lines.append((_status("camera", "unknown", step.camera.reason), _WHITE))

@@ -28,7 +28,7 @@ from streamtrack.targets import (
 )
 from streamtrack.template import make_template
 from streamtrack.tracker import DetectTracker, HybridTracker, TargetTracker
-from streamtrack.types import CameraPose, Frame, Step, Track
+from streamtrack.types import AUTO_STAGE, CameraPose, Frame, Step, Track
 from streamtrack.working_size import WorkingSize, graph_in_full_size
 from streamtrack.world import WorldMotion
 
@@ -96,7 +96,7 @@ def track(
         ended = time.perf_counter()
         stage_ms = {**track_ms, "total": (ended - began) * 1e3}
         if auto is not None:
-            stage_ms["auto"] = (ended - camera_ended) * 1e3
+            stage_ms[AUTO_STAGE] = (ended - camera_ended) * 1e3
         if view.detected is not None:
             stage_ms["detect"] = view.detect_ms
         if settings.camera != "fixed":

@@ -18,6 +18,7 @@ import rerun as rr
 
 from streamtrack import blueprint, recorded_rows
 from streamtrack.errors import OutputError
+from streamtrack.recorded_found import FoundLog
 from streamtrack.recorded_mosaic import MosaicLog
 from streamtrack.recorded_target import TargetLog
 from streamtrack.recorded_tracks import TracksTable
@@ -67,6 +68,7 @@ class StepLog:
         self._templates = dict(templates)
         self._target_count = len(target_names)
         self._targets: dict[str, TargetLog] = {}
+        self._found = FoundLog(stream)
         self._mosaic = MosaicLog(stream)
         self._world = world
         self._table = TracksTable(stream, settings.world != WorldSettings())
@@ -91,6 +93,7 @@ class StepLog:
         for number, (stage, path) in enumerate(self._stages.items()):
             blueprint.log_stage_style(self._stream, path, stage, number)
         self.video.begin()
+        self._found.begin()
         self._mosaic.begin()
         self._table.begin()
         self._has_points = False
@@ -118,9 +121,13 @@ class StepLog:
             self.log_line("WARN", f"frame {step.frame.index}: the source began anew")
         self._log_points(step)
         for track in step.tracks:
+            if track.is_found:
+                continue
             message = self._target(track.name).log(step, track)
             if message:
                 self.log_line(_level_of(track.state), message)
+        for message in self._found.log(step):
+            self.log_line("INFO", message)
         self._log_times(step)
         self._table.follow(step)
         if self._world is blueprint.World.PATHS:
@@ -257,6 +264,8 @@ class StepLog:
         lines = [np.zeros((0, 2, 2), np.float32)]
         classes = [np.zeros(0, np.uint16)]
         for track in tracks:
+            if track.is_found:
+                continue
             start = self._target(track.name).points_before(track)
             if start is not None:
                 lines.append(np.stack([start, track.evidence.frame_points], axis=1))

@@ -8,6 +8,7 @@ inliers, transformation model. Definitions:
     inliers        those of them that agree with the estimate
     rmse_px        mean over the tracked frames of the inliers' RMS transfer error
     budget         null without one; ``frames_at_level`` counts frames by level of work, full first
+    automatic      targets found by their motion; ``most_at_once`` of them tracked in one frame
     losses         changes from tracking to lost
     ms_per_frame   wall time of a frame, its stages together; quantiles are nearest-rank, from
                    bins 1 % wide, so right to 0.5 %; ``by_stage`` is the mean over all frames
@@ -32,7 +33,7 @@ from streamtrack.meters import LogHistogram, Mean, nearest_rank, peak_rss_mb
 from streamtrack.outputs import write_file
 from streamtrack.settings import Settings
 from streamtrack.sources.live_status import LiveStatus
-from streamtrack.types import Size, Skipped, SourceInfo, Step, Track, TrackState
+from streamtrack.types import AUTO_STAGE, Size, Skipped, SourceInfo, Step, Track, TrackState
 
 _LIVE_COUNTS = ("captured", "dropped", "thinned", "lost", "damaged", "reconnects", "stalls")
 
@@ -55,6 +56,8 @@ class TargetSummary:
     matches: float | None
     inliers: float | None
     models: dict[str, int]
+    last_seen: int | None = None
+    is_found: bool = False
 
     @property
     def share(self) -> float:
@@ -84,15 +87,19 @@ class _TargetSums:
     matches: Mean = field(default_factory=Mean)
     inliers: Mean = field(default_factory=Mean)
     models: Counter[str] = field(default_factory=Counter)
+    last_seen: int | None = None
+    is_found: bool = False
 
     def add(self, track: Track, frame: int) -> None:
         self.states[track.state] += 1
+        self.is_found = track.is_found
         self.losses += self.last is TrackState.TRACKING and track.state is TrackState.LOST
         self.last = track.state
         if track.state is not TrackState.TRACKING:
             return
         if self.first_seen is None:
             self.first_seen = frame
+        self.last_seen = frame
         self.rmse_px.add(track.rmse_px)
         self.matches.add(len(track.evidence))
         self.inliers.add(track.evidence.inliers)
@@ -111,6 +118,8 @@ class _TargetSums:
             self.matches.value,
             self.inliers.value,
             dict(self.models.most_common()),
+            self.last_seen,
+            self.is_found,
         )
 
 
@@ -139,6 +148,12 @@ class Summary:
     ended: str
     live: LiveStatus | None = None
     camera_notes: tuple[str, ...] = ()
+    auto_at_once: int | None = None
+
+    @property
+    def given(self) -> tuple[TargetSummary, ...]:
+        """The targets that the user has shown."""
+        return tuple(target for target in self.targets if not target.is_found)
 
     @property
     def fps(self) -> float | None:
@@ -177,6 +192,7 @@ class Summary:
             "matches": {"mean": self.matches, "median": self.matches_median},
             "inliers": self.inliers,
             "models": self.models,
+            "automatic_targets": self._auto_json(),
             "targets": [_target_json(target) for target in self.targets],
             "ms_per_frame": {
                 "median": self.ms_median,
@@ -217,7 +233,8 @@ class Summary:
             ("Transformation model", used or self.settings.registration.model),
             ("Camera", camera),
             ("Frames", str(self.frames)),
-            *((f"Target {target.name}", target.to_text()) for target in self.targets),
+            *((f"Target {target.name}", target.to_text()) for target in self.given),
+            *self._auto_rows(),
             ("Tracking time a frame", ms),
             *self._budget_rows(),
             ("Frames a second", f"{_number(self.fps, 1)}, reading and writing included"),
@@ -251,6 +268,28 @@ class Summary:
         if budget_ms is None:
             return None
         return {"ms": budget_ms, "frames_at_level": list(self.frames_at_level)}
+
+    def _auto_json(self) -> dict[str, int] | None:
+        if self.auto_at_once is None:
+            return None
+        return {
+            "count": len(self.targets) - len(self.given),
+            "most_at_once": self.auto_at_once,
+        }
+
+    def _auto_rows(self) -> list[tuple[str, str]]:
+        if self.auto_at_once is None:
+            return []
+        found = [target for target in self.targets if target.is_found]
+        if not found:
+            return [("Automatic targets", "none: nothing was seen to move against the background")]
+        lives = sorted(target.frames_tracked for target in found)
+        text = (
+            f"{len(found)}, at most {self.auto_at_once} at once; tracked in "
+            f"{lives[len(lives) // 2]} frames in the median, {lives[-1]} at most; "
+            f"lost {sum(target.losses for target in found)} times"
+        )
+        return [("Automatic targets", text)]
 
     def _budget_rows(self) -> list[tuple[str, str]]:
         budget_ms = self.settings.tracker.budget_ms
@@ -287,6 +326,8 @@ def _target_json(target: TargetSummary) -> dict[str, Any]:
         "frames_searching": target.frames_searching,
         "share": target.share,
         "first_seen": target.first_seen,
+        "last_seen": target.last_seen,
+        "automatic": target.is_found,
         "losses": target.losses,
         "rmse_px": target.rmse_px,
         "matches": target.matches,
@@ -325,6 +366,7 @@ class SummaryBuilder:
         self._features, self._inliers = Mean(), Mean()
         self._match_counts: Counter[int] = Counter()
         self._targets: dict[str, _TargetSums] = {}
+        self._auto_at_once: int | None = None
         self._frames_at_level = [0] * len(LEVELS)
         self._ms = LogHistogram()
         self._stage_ms: dict[str, float] = {}
@@ -344,6 +386,9 @@ class SummaryBuilder:
             self._features.add(len(step.features))
         for track in step.tracks:
             self._add_track(track, step.frame.index)
+        if AUTO_STAGE in step.stage_ms:
+            found = sum(track.is_found and track.quad is not None for track in step.tracks)
+            self._auto_at_once = max(found, self._auto_at_once or 0)
         self._add_times(step.stage_ms)
 
     def _add_track(self, track: Track, frame: int) -> None:
@@ -394,4 +439,5 @@ class SummaryBuilder:
             ended=ended,
             live=live,
             camera_notes=self._camera.all(),
+            auto_at_once=self._auto_at_once,
         )

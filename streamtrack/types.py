@@ -282,6 +282,8 @@ class Track:
     empty otherwise. ``means`` names the way the result was found (``flow``, ``guided``, ``global``,
     ``detect``); ``correlation`` is the normalised cross-correlation of target and picture, or NaN.
     ``world`` is where it is in the world; None if that or the camera's pose is not known.
+    ``is_found`` marks an automatic target: it was found by its motion (``means`` ``motion``, or
+    ``carried`` where only its pixels' motion was seen) and may end any time.
     """
 
     name: str
@@ -295,6 +297,7 @@ class Track:
     means: str = ""
     reason: str = ""
     world: WorldPlace | None = None
+    is_found: bool = False
 
     def __post_init__(self) -> None:
         is_tracking = self.state is TrackState.TRACKING
@@ -302,6 +305,10 @@ class Track:
             self.frame_from_template is not None
         ):
             raise ValueError("quad and frame_from_template are given exactly while tracking")
+
+
+AUTO_STAGE = "auto"
+"""Key of `Step.stage_ms` that is there while automatic targets are looked for."""
 
 
 class CameraKind(StrEnum):

@@ -11,11 +11,11 @@ import numpy.typing as npt
 
 from streamtrack.auto.assignment import assign
 from streamtrack.auto.blobs import Blob, united_blob
-from streamtrack.auto.followed import Followed, Life, overlap
+from streamtrack.auto.followed import Followed, Life, overlap, overlaps
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
-_MAX_COST = 1.2
+_MAX_COST = 1.7
 _FRAGMENT_INSIDE = 0.7  # of a fragment's area that lies in the predicted box
 _FRAGMENT_SHARE = 0.4  # of the largest of them
 _SHARED_INSIDE = 0.55  # of a predicted box that lies in a blob it shares
@@ -38,8 +38,7 @@ class Associated:
 def associate(things: Sequence[Followed], blobs: Sequence[Blob], reach_px: float) -> Associated:
     """Pair things, already predicted, with blobs; ``reach_px`` is added to every gate."""
     wholes = _put_together(things, blobs)
-    costs = np.array([[_cost(thing, blob, reach_px) for blob in wholes] for thing in things])
-    found = dict(assign(costs.reshape(len(things), len(wholes))))
+    found = dict(assign(_costs(things, wholes, reach_px)))
     shared = {column: _sharing(things, blob, column, found) for column, blob in enumerate(wholes)}
     shared = {column: rows for column, rows in shared.items() if rows}
     told = {row for rows in shared.values() for row in rows}
@@ -51,55 +50,68 @@ def associate(things: Sequence[Followed], blobs: Sequence[Blob], reach_px: float
     )
 
 
-def color_distance(one: Doubles, other: Doubles) -> float:
-    """Hellinger distance (0..1) of two histograms."""
-    return float(np.sqrt(max(0.0, 1.0 - float(np.sum(np.sqrt(one * other))))))
-
-
-def _cost(thing: Followed, blob: Blob, reach_px: float) -> float:
-    """How unlike a thing where it should be is a blob; infinite beyond the gate."""
-    off = float(np.hypot(*(thing.center - blob.center)))
-    extent = 0.5 * float(np.hypot(*thing.size) + np.hypot(*blob.size))
-    gate_px = 0.6 * extent + reach_px
-    color = color_distance(thing.colors, blob.colors)
-    if thing.life is Life.LOST:
-        gate_px = 0.6 * extent + reach_px + 0.5 * thing.lost_s * float(np.hypot(*thing.velocity))
-        ratio = float(np.prod(blob.size) / np.prod(thing.size))
-        if color > _MAX_COLOR_DISTANCE or not 1 / 3 < ratio < 3:
-            return np.inf
-    iou, _ = overlap(thing.box, blob.box)
-    if off > gate_px and iou < 0.1:
-        return np.inf
-    late = 0.5 if thing.life is Life.LOST else 0.25 if thing.life is Life.NEW else 0.0
-    cost = (1 - iou) + 0.5 * off / gate_px + 0.3 * color + late
-    return cost if cost < _MAX_COST + late + 0.5 else np.inf
+def _costs(things: Sequence[Followed], blobs: Sequence[Blob], reach_px: float) -> Doubles:
+    """How unlike each thing where it should be is each blob (N, M); infinite beyond the gate."""
+    if not things or not blobs:
+        return np.zeros((len(things), len(blobs)))
+    thing_boxes = np.stack([thing.box for thing in things])
+    blob_boxes = np.stack([blob.box for blob in blobs])
+    thing_sizes, blob_sizes = (b[:, 2:] - b[:, :2] for b in (thing_boxes, blob_boxes))
+    middles = 0.5 * (thing_boxes[:, None, :2] + thing_boxes[:, None, 2:])
+    off = np.linalg.norm(middles - 0.5 * (blob_boxes[:, :2] + blob_boxes[:, 2:]), axis=2)
+    extents = np.linalg.norm(thing_sizes, axis=1)[:, None] + np.linalg.norm(blob_sizes, axis=1)
+    is_lost = np.array([thing.life is Life.LOST for thing in things])[:, None]
+    is_new = np.array([thing.life is Life.NEW for thing in things])[:, None]
+    drift = np.array([0.5 * t.lost_s * float(np.hypot(*t.velocity)) for t in things])[:, None]
+    gate_px = 0.3 * extents + reach_px + np.where(is_lost, drift, 0.0)
+    shared = (
+        np.sqrt(np.stack([thing.colors for thing in things]))
+        @ np.sqrt(np.stack([blob.colors for blob in blobs])).T
+    )
+    color = np.sqrt(np.maximum(0.0, 1.0 - shared))  # Hellinger distance
+    ious, _ = overlaps(thing_boxes, blob_boxes)
+    insides = overlaps(blob_boxes, thing_boxes)[1].T
+    is_part = insides >= _FRAGMENT_INSIDE  # of something that is partly hidden
+    ious = np.where(is_part, np.maximum(ious, 0.3), ious)
+    late = np.where(is_lost, 0.5, np.where(is_new, 0.25, 0.0))
+    costs = (1 - ious) + 0.5 * off / gate_px + 0.3 * color + late
+    ratio = np.prod(blob_sizes, axis=1) / np.prod(thing_sizes, axis=1)[:, None]
+    is_other = (color > _MAX_COLOR_DISTANCE) | (ratio > 3)
+    is_other |= (ratio < 1 / 3) & (insides < _FRAGMENT_INSIDE)
+    is_beyond = (off > gate_px) & (ious < 0.1)
+    is_beyond |= (is_lost & is_other) | (costs - late > _MAX_COST)
+    return np.where(is_beyond, np.inf, costs)
 
 
 def _put_together(things: Sequence[Followed], blobs: Sequence[Blob]) -> list[Blob]:
     """The blobs, those that are fragments of one thing made one."""
-    remaining = list(blobs)
-    for thing in sorted(things, key=lambda thing: -float(np.prod(thing.size))):
-        if thing.life in (Life.NEW, Life.LOST):
+    if not things or not blobs:
+        return list(blobs)
+    thing_boxes = np.stack([thing.box for thing in things])
+    blob_boxes = np.stack([blob.box for blob in blobs])
+    reach = 0.1 * (thing_boxes[:, 2:] - thing_boxes[:, :2])
+    around = thing_boxes + np.concatenate([-reach, reach], axis=1)
+    inside = overlaps(blob_boxes, around)[1].T  # share of each blob in each thing's surroundings
+    ious = overlaps(thing_boxes, blob_boxes)[0]
+    areas = np.prod(blob_boxes[:, 2:] - blob_boxes[:, :2], axis=1)
+    united: dict[int, Blob] = {}
+    gone: set[int] = set()
+    order = np.argsort(-np.prod(thing_boxes[:, 2:] - thing_boxes[:, :2], axis=1), kind="stable")
+    for row in order.tolist():
+        if things[row].life in (Life.NEW, Life.LOST):
             continue
-        reach = 0.1 * thing.size
-        around = thing.box + np.concatenate([-reach, reach])
-        parts = [
-            blob
-            for blob in remaining
-            if overlap(blob.box, around)[1] >= _FRAGMENT_INSIDE
-            and not any(
-                other is not thing and overlap(other.box, blob.box)[0] > 0.5 for other in things
-            )
-        ]
-        sizes = sorted(float(np.prod(part.size)) for part in parts)
+        is_other_whole = (np.delete(ious, row, axis=0) > 0.5).any(axis=0)
+        parts = np.flatnonzero((inside[row] >= _FRAGMENT_INSIDE) & ~is_other_whole).tolist()
+        parts = [part for part in parts if part not in gone]
+        sizes = sorted(areas[parts])
         if len(parts) < 2 or sizes[-2] > _FRAGMENT_SHARE * sizes[-1]:
             continue  # two that are alike in size are two things
-        whole = united_blob(parts)
-        best = max(overlap(part.box, thing.box)[0] for part in parts)
-        if overlap(whole.box, thing.box)[0] > best:
-            remaining = [blob for blob in remaining if not any(blob is part for part in parts)]
-            remaining.append(whole)
-    return remaining
+        whole = united_blob([blobs[part] for part in parts])
+        if overlap(whole.box, things[row].box)[0] > ious[row, parts].max():
+            united[parts[0]] = whole
+            gone.update(parts)
+    kept = [blob for column, blob in enumerate(blobs) if column not in gone]
+    return kept + list(united.values())
 
 
 def _sharing(

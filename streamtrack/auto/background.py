@@ -13,7 +13,7 @@ gradually over the picture, changes the background with it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias, TypeVar
 
 import cv2
@@ -32,14 +32,16 @@ _KNOWN_AGE = 3  # frames before a pixel is judged
 _MIN_CONTRAST = 11.0  # grey levels
 _NOISE_FACTOR = 4.0
 _MAX_CONTRAST = 60.0
+_BROKEN_SHARE = 0.5
 _LOW_SHARE = 0.55  # of the contrast, for pixels that adjoin clear ones
-_MAX_TURN_PX = 4.0  # by which the view may differ from a shifted grid at its corners
+_MAX_TURN_PX = 8.0  # by which the view may differ from a shifted grid at its corners
 _BLOCKS = (8, 6)
 _MAX_LOG_GAIN = 0.7
 _GAIN_SCALE = 0.06  # of blocks that follow the common change of light, in log units
 _LEAST_LOG_GAIN = 0.004
 _LEFT_RATIO = 0.7  # of edges now and in the background, along what something left behind
 _SAME_COLOR = 14.0  # grey levels within which a candidate is confirmed
+_RESTLESS_RATE = 0.08  # at which the noise of what flickers or sways in its place is learned
 _DARKEST_SHADE = 0.45
 _LOG = np.log(np.arange(256, dtype=np.float32) + 6)
 _BOX = np.ones((3, 3), np.uint8)
@@ -55,6 +57,8 @@ class Outstanding:
     grey, grey_before uint8 (h, w), this frame and the one before, None if that is not known
     grid_from_frame   full-resolution pixels to grid pixels
     known             bool (h, w), what the model and the frame know
+    noise             grey levels by which the frame differs from the background in general
+    comparable        bool (h, w), what this frame and the one before show
     """
 
     clear: Mask
@@ -65,11 +69,14 @@ class Outstanding:
     grey_before: Image | None
     grid_from_frame: Matrix
     known: Mask
+    comparable: Mask
+    noise: float
 
     @property
-    def share(self) -> float:
-        """Share of the grid that stands out clearly."""
-        return float(np.mean(self.clear))
+    def is_explained(self) -> bool:
+        """False if the frame is, in most places, not the background at all."""
+        is_near = _NOISE_FACTOR * self.noise <= _MAX_CONTRAST
+        return is_near and float(np.mean(self.clear)) <= _BROKEN_SHARE
 
 
 class BackgroundModel:
@@ -85,17 +92,19 @@ class BackgroundModel:
         self._candidate: Floats = np.zeros((height, width, 3), np.float32)
         self._candidate_age: Floats = np.zeros((height, width), np.float32)
         self._grey_before: Image | None = None
+        self._seen_before: Mask = np.zeros((height, width), np.bool_)
 
     def compare(
         self, small: Image, world_from_small: Matrix, small_from_frame: Matrix
     ) -> Outstanding:
         """What stands out in a reduced frame (h, w, 3) whose place in the world is given."""
         grid_from_small = self._follow(world_from_small)
+        small = np.asarray(cv2.GaussianBlur(small, (3, 3), 0), np.uint8)
         image, seen = self._in_grid(small, grid_from_small)
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
         known = seen & (self._age >= _KNOWN_AGE)
-        self._relight(grey, known)
-        background = np.asarray(cv2.convertScaleAbs(self._mean), np.uint8)
+        relit = self._relit(grey, known)
+        background = np.asarray(cv2.convertScaleAbs(relit), np.uint8)
         distance = _largest_channel(
             cv2.max(
                 cv2.subtract(image, cv2.dilate(background, _BOX)),
@@ -103,14 +112,15 @@ class BackgroundModel:
             )
         )
         off = _largest_channel(cv2.absdiff(image, background))
-        noise = 1.4826 * float(np.median(off[::3, ::3]))
+        noise = _noise(off[::3, ::3], known[::3, ::3])
         limit = np.maximum(self._deviation, np.float32(noise)) * np.float32(_NOISE_FACTOR)
         np.clip(limit, _MIN_CONTRAST, _MAX_CONTRAST, out=limit)
         clear = known & (distance > limit)
         limit *= np.float32(_LOW_SHARE)
         faint = known & (distance > limit)
-        self._last = (image, off, seen)
+        self._last = (image, off, seen, relit)
         before, self._grey_before = self._grey_before, grey
+        comparable, self._seen_before = seen & self._seen_before, seen
         return Outstanding(
             clear,
             faint,
@@ -120,6 +130,17 @@ class BackgroundModel:
             before,
             grid_from_small @ small_from_frame,
             known,
+            comparable,
+            noise,
+        )
+
+    def with_young(self, outstanding: Outstanding, moving: Mask) -> Outstanding:
+        """What differs, with what moves (h, w) before a background that is not known yet."""
+        young = moving & ~outstanding.known
+        if not young.any():
+            return outstanding
+        return replace(
+            outstanding, clear=outstanding.clear | young, faint=outstanding.faint | young
         )
 
     def learn(self, outstanding: Outstanding, moving: Mask, protected: Mask) -> None:
@@ -128,7 +149,7 @@ class BackgroundModel:
         ``moving`` (h, w) is not at rest, and so no background that is not known yet; ``protected``
         belongs to things that are followed.
         """
-        image, off, seen = self._last
+        image, off, seen, self._mean = self._last
         is_young = self._age < _KNOWN_AGE
         self._age[is_young & moving] = 0
         is_new = seen & (self._age == 0)
@@ -140,6 +161,8 @@ class BackgroundModel:
         change = cv2.subtract(image, self._mean, dtype=cv2.CV_32F)
         self._mean += cv2.multiply(change, cv2.merge([rate, rate, rate]))
         excess = np.minimum(off, 40).astype(np.float32) * np.float32(1.2)
+        restless = outstanding.faint & seen & ~moving & ~protected
+        rate[restless] = _RESTLESS_RATE
         self._deviation += rate * (excess - self._deviation)
         self._age += matches
         self._candidate_age -= matches & (self._candidate_age > 0)
@@ -151,7 +174,7 @@ class BackgroundModel:
 
         Its outline is then an edge of the background, and none of what is seen now.
         """
-        image, _, _ = self._last
+        image, _, _, _ = self._last
         inner = cv2.erode(place.astype(np.uint8), _BOX)
         outline = cv2.dilate(place.astype(np.uint8), _BOX) > inner
         now = np.mean(_edges(image)[outline]) if outline.any() else 0.0
@@ -161,7 +184,7 @@ class BackgroundModel:
 
     def heal(self, place: Mask) -> None:
         """Take what is seen at a place (h, w) for background from now on."""
-        image, _, seen = self._last
+        image, _, seen, _ = self._last
         place = place & seen
         self._mean[place] = image[place]
         self._age[place] = _KNOWN_AGE
@@ -216,6 +239,7 @@ class BackgroundModel:
         self._candidate_age = _shifted(self._candidate_age, dx, dy)
         if self._grey_before is not None:
             self._grey_before = _shifted(self._grey_before, dx, dy)
+            self._seen_before = _shifted(self._seen_before, dx, dy)
 
     def _warp(self, new_from_grid: Matrix) -> None:
         """Lay the models out anew after a turn or a zoom."""
@@ -250,18 +274,18 @@ class BackgroundModel:
         cv2.fillConvexPoly(seen, outline, 1)
         return np.asarray(image, np.uint8), seen > 0
 
-    def _relight(self, grey: Image, known: Mask) -> None:
-        """Change the background with the light."""
+    def _relit(self, grey: Image, known: Mask) -> Floats:
+        """The background's mean (h, w, 3) in the light of the frame."""
         if np.mean(known) < 0.2:
-            return
+            return self._mean
         mean = cv2.convertScaleAbs(self._mean[::2, ::2])
         background = np.asarray(cv2.cvtColor(mean, cv2.COLOR_BGR2GRAY), np.uint8)
         log_gain = _light_change(grey[::2, ::2], background, known[::2, ::2])
         if log_gain is None or np.abs(log_gain).max() < _LEAST_LOG_GAIN:
-            return
+            return self._mean
         field = cv2.resize(np.exp(log_gain), self.size_wh, interpolation=cv2.INTER_LINEAR)
-        self._mean *= np.asarray(field, np.float32)[:, :, None]
-        np.minimum(self._mean, 255.0, out=self._mean)
+        relit = self._mean * np.asarray(field, np.float32)[:, :, None]
+        return np.asarray(np.minimum(relit, 255.0, out=relit), np.float32)
 
 
 def _shifted(array: npt.NDArray[_Number], dx: int, dy: int) -> npt.NDArray[_Number]:
@@ -318,6 +342,12 @@ def _edges(image: Image) -> Image:
     """Strength (h, w) of the edges in a picture (h, w, 3)."""
     gradient = cv2.morphologyEx(image, cv2.MORPH_GRADIENT, _BOX)
     return _largest_channel(gradient)
+
+
+def _noise(off: Image, known: Mask) -> float:
+    """Standard deviation from the median of differences (h, w) where the background is known."""
+    values = off[known]
+    return 1.4826 * float(np.median(values)) if len(values) else 0.0
 
 
 def _largest_channel(image: npt.NDArray[np.integer[Any] | np.floating[Any]]) -> Image:

@@ -16,6 +16,7 @@ from streamtrack.types import Image, Mask
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
+_CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 _LEAST_PIXELS = 14  # of the grid
 _LEAST_CLEAR = 6
 _ALL_KNOWN_SHARE = 0.98
@@ -74,6 +75,7 @@ class MotionField:
 
     def __init__(self) -> None:
         self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+        self._flow.setFinestScale(1)
 
     def measure(self, outstanding: Outstanding) -> npt.NDArray[np.float32] | None:
         """(h, w, 2) grid pixels since the frame before; None without anything to measure."""
@@ -158,7 +160,7 @@ def frame_px(outstanding: Outstanding) -> float:
 def _joined(clear: Mask, faint: Mask, shade: Mask) -> Image:
     """What differs (h, w), without its shadows and with its gaps closed."""
     differing = ((faint | clear) & ~shade).astype(np.uint8)
-    solid = np.asarray(cv2.medianBlur(differing, 3), np.uint8)
+    solid = np.asarray(cv2.morphologyEx(cv2.medianBlur(differing, 3), cv2.MORPH_OPEN, _CROSS))
     closed = cv2.morphologyEx(solid, cv2.MORPH_CLOSE, _ellipse(_CLOSING_PX))
     within = cv2.morphologyEx(solid, cv2.MORPH_CLOSE, _ellipse(_SHADE_CLOSING_PX))
     return np.asarray(cv2.bitwise_or(closed, cv2.bitwise_and(within, shade.astype(np.uint8))))

@@ -17,6 +17,10 @@ Doubles: TypeAlias = npt.NDArray[np.float64]
 
 _POSITION_GAIN = 0.7  # share of what was found in the place of the next frame
 _SIZE_GAIN = 0.25
+_CUT_SHARE = 0.8  # of its size: when less is found it is partly hidden
+_GROWN_SHARE = 1.4  # when more is found it has met something
+_ODD_FRAMES = 7  # for which it keeps its size all the same
+_KNOWN_HITS = 12  # sightings after which its size is known
 _SPEED_GAIN = 0.3
 _COLOR_RATE = 0.1
 _EDGE_PX = 3.0
@@ -56,6 +60,7 @@ class Followed:
     flow_px: Doubles | None = None
     lost_s: float = 0.0
     still: int = 0
+    odd: int = 0
     reason: str = ""
 
     @classmethod
@@ -104,19 +109,23 @@ class Followed:
     def take(self, blob: Blob, step_s: float, size_wh: Size) -> None:
         """It was found as this blob."""
         before = self.center - self.velocity * step_s
-        predicted = self.box
-        touches = touched_edges(blob.box, size_wh) | touched_edges(predicted, size_wh)
-        is_whole = not touches.any()
-        off = blob.box - predicted
-        if self.life is Life.LOST or not is_whole:
+        touches = touched_edges(blob.box, size_wh) | touched_edges(self.box, size_wh)
+        was_lost = self.life is Life.LOST
+        if touches.any() and not was_lost:
+            shift = 0.5 * (blob.box - self.box).reshape(2, 2).sum(axis=0)
             self.box = blob.box.copy()
         else:
-            shift = 0.5 * (off[:2] + off[2:])
-            growth = 0.5 * (off[2:] - off[:2])
-            center = self.center + _POSITION_GAIN * shift
-            self.place(center, self.size + 2 * _SIZE_GAIN * growth)
-        if self.life is not Life.LOST:
-            self._learn_speed(blob, 0.5 * (off[:2] + off[2:]), step_s, is_whole)
+            is_odd = bool(_is_odd(self.box, blob.box).any())
+            self.odd = self.odd + 1 if is_odd else 0
+            if was_lost or (self.hits >= _KNOWN_HITS and self.odd <= _ODD_FRAMES):
+                shift, growth = _by_nearer_end(self.box, blob.box)
+            else:
+                low, high = (blob.box - self.box).reshape(2, 2)
+                shift, growth = 0.5 * (low + high), high - low
+            gain = 1.0 if was_lost else _POSITION_GAIN
+            self.place(self.center + gain * shift, self.size + _SIZE_GAIN * growth)
+        if not was_lost:
+            self._learn_speed(blob, shift, step_s, not touches.any())
         self.path_px += float(np.hypot(*(self.center - before)))
         self.colors = self.colors + _COLOR_RATE * (blob.colors - self.colors)
         self.hits += 1
@@ -154,6 +163,26 @@ class Followed:
         self.velocity = self.velocity + gain * (measured - self.velocity)
 
 
+def _by_nearer_end(expected: Doubles, found: Doubles) -> tuple[Doubles, Doubles]:
+    """Shift (2,) and growth (2,) that take the expected box to a box of another size.
+
+    Where much less is found it is partly hidden, where much more it has met something: it keeps
+    its size then, and the end that is nearer to where it should be counts.
+    """
+    low, high = (found - expected).reshape(2, 2)
+    is_odd = _is_odd(expected, found)
+    nearer = np.where(np.abs(low) <= np.abs(high), low, high)
+    shift = np.where(is_odd, nearer, 0.5 * (low + high))
+    return shift, np.where(is_odd, 0.0, high - low)
+
+
+def _is_odd(expected: Doubles, found: Doubles) -> npt.NDArray[np.bool_]:
+    """Along which axes (2,) much less or more is found than expected."""
+    ratio = (found[2:] - found[:2]) / np.maximum(expected[2:] - expected[:2], 1e-6)
+    odd: npt.NDArray[np.bool_] = (ratio < _CUT_SHARE) | (ratio > _GROWN_SHARE)
+    return odd
+
+
 def _carried(frame_from_before: Matrix, point: Doubles) -> tuple[Doubles, float]:
     """A point (2,) seen by the camera of the next frame, and how much larger things are there."""
     moved = geometry.transform_points(frame_from_before, point)[0].astype(np.float64)
@@ -170,11 +199,21 @@ def touched_edges(box: Doubles, size_wh: Size) -> npt.NDArray[np.bool_]:
 
 
 def overlap(one: Doubles, other: Doubles) -> tuple[float, float]:
-    """Intersection of two boxes over their union, and over the first."""
-    sides = np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2])
-    if sides[0] <= 0 or sides[1] <= 0:
+    """Intersection of two boxes (4,) over their union, and over the first."""
+    x0, y0, x1, y1 = one.tolist()
+    u0, v0, u1, v1 = other.tolist()
+    width, height = min(x1, u1) - max(x0, u0), min(y1, v1) - max(y0, v0)
+    if width <= 0 or height <= 0:
         return 0.0, 0.0
-    common = float(sides[0] * sides[1])
-    area = float(np.prod(one[2:] - one[:2]))
-    union = area + float(np.prod(other[2:] - other[:2])) - common
-    return common / union, common / area
+    common, area = width * height, (x1 - x0) * (y1 - y0)
+    return common / (area + (u1 - u0) * (v1 - v0) - common), common / area
+
+
+def overlaps(ones: Doubles, others: Doubles) -> tuple[Doubles, Doubles]:
+    """`overlap` of each of the boxes (N, 4) with each of the others (M, 4), both (N, M)."""
+    low = np.maximum(ones[:, None, :2], others[None, :, :2])
+    high = np.minimum(ones[:, None, 2:], others[None, :, 2:])
+    common = np.prod(np.maximum(high - low, 0.0), axis=2)
+    area = np.prod(ones[:, 2:] - ones[:, :2], axis=1)[:, None]
+    other_area = np.prod(others[:, 2:] - others[:, :2], axis=1)[None]
+    return common / (area + other_area - common), common / area

@@ -12,7 +12,6 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -21,6 +20,15 @@ from streamtrack.auto.association import associate
 from streamtrack.auto.background import BackgroundModel, Outstanding
 from streamtrack.auto.blobs import Blob, MotionField, Scene, find_blobs, frame_px
 from streamtrack.auto.followed import Followed, Life, overlap, touched_edges
+from streamtrack.auto.places import (
+    REST_PX,
+    fill,
+    hidden_by,
+    is_invertible,
+    motion_within,
+    moving_pixels,
+    reduced,
+)
 from streamtrack.frame_view import FrameView
 from streamtrack.types import (
     CameraPose,
@@ -35,7 +43,6 @@ from streamtrack.types import (
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
-_WIDTH_PX = 320
 _LEAST_WIDTH_PX = 24
 _CONFIRMED_S = 0.12
 _LEAST_HITS = 4
@@ -43,18 +50,17 @@ _MOVED_PX = 2.5  # grid pixels
 _MOVED_SHARE = 0.06  # of its size
 _STRAIGHT_SHARE = 0.5  # of its path
 _FLOWED_SHARE = 0.3  # of its way, that its pixels must have moved along
+_FAR_SHARE = 0.4  # of its size, beyond which that is not asked for: flow hardly sees small things
 _MAX_MISSES = 2  # frames, of what is not confirmed yet
 _COAST_S = 2.0
 _SLOWER_AFTER_S = 0.5  # lost, until which it is thought to go on as fast
 _MOST_TARGETS = 60
-_BROKEN_SHARE = 0.5  # of the picture that changes at once
 _BROKEN_FRAMES = 5  # in a row, after which the scene is another one
 _DUPLICATE_OVERLAP = 0.75
 _CARRYING_SHARE = 0.3  # of a thing's place that must stand out for it to be carried
 _REACH_PX = 4.0  # grid pixels, beyond which nothing is found again
 _ELDER_HITS = 10  # sightings of its own that make it a thing of its own
 _ALIKE_PX = 0.8  # grid pixels a frame, between motions of parts of one thing
-_REST_PX = 0.4  # grid pixels a frame, below which a thing stands
 _REST_FRAMES = 8
 _USUAL_STEP_S = 0.04
 _MAX_STEP_S = 1.0
@@ -72,6 +78,7 @@ class _Moment:
 class AutoTargets:
     """Finds and follows what moves; names are ``<prefix>-1``, ``<prefix>-2`` ..., none twice.
 
+    ``blobs`` is what stood out in the last frame.
     ``taken`` names are left out, and the numbers go on after ``count``.
     """
 
@@ -79,6 +86,7 @@ class AutoTargets:
         self._prefix = prefix
         self._taken = frozenset(taken)
         self.count = count
+        self.blobs: tuple[Blob, ...] = ()
         self._field = MotionField()
         self._background: BackgroundModel | None = None
         self._things: list[Followed] = []
@@ -99,9 +107,9 @@ class AutoTargets:
         """The targets in this frame; what belongs to the ``given`` ones is left to them."""
         step_s = self._clocked(view.frame.time_s)
         world_from_frame = pose.world_from_frame
-        if world_from_frame is None or not _is_invertible(world_from_frame):
+        if world_from_frame is None or not is_invertible(world_from_frame):
             return self._blind("the camera's pose is not known")
-        small, small_from_frame = _reduced(view)
+        small, small_from_frame = reduced(view)
         if min(small.shape[:2]) < _LEAST_WIDTH_PX:
             return self._blind("the picture is too small")
         size_wh = (small.shape[1], small.shape[0])
@@ -112,15 +120,19 @@ class AutoTargets:
             self._background = BackgroundModel(size_wh, world_from_small)
         seen = self._background.compare(small, world_from_small, small_from_frame)
         self._predict(world_from_frame, view.frame.time_s)
-        if seen.share > _BROKEN_SHARE:
+        if not seen.is_explained:
             return self._broken_off(world_from_small, small, small_from_frame)
         self._broken = 0
-        scene = find_blobs(seen, _hidden(seen, given), self._field.measure(seen))
+        motion = self._field.measure(seen)
+        moving, changing = moving_pixels(seen, motion)
+        seen = self._background.with_young(seen, changing)
+        scene = find_blobs(seen, hidden_by(seen, given), motion)
+        self.blobs = scene.blobs
         moment = _Moment(step_s, frame_px(seen), view.size_wh)
         self._associate(scene, moment)
-        self._confirm(moment.grid_px)
-        self._drop_duplicates()
-        self._background.learn(seen, _moving(scene), self._protected(seen))
+        self._background.learn(seen, moving, self._protected(seen))
+        self._confirm(self._background, scene, moment)
+        self._drop_duplicates(moment)
         self._end_left_places(self._background, scene, moment)
         return self._tracks()
 
@@ -193,14 +205,9 @@ class AutoTargets:
         for thing in self._things:
             if thing.life not in (Life.SEEN, Life.CARRIED):
                 continue
-            thing.note_rest(_REST_PX * moment.grid_px, moment.step_s)
+            thing.note_rest(REST_PX * moment.grid_px, moment.step_s)
             if thing.still >= _REST_FRAMES and thing.still % _REST_FRAMES == 0:
-                place = np.zeros(scene.solid.shape, np.uint8)
-                _fill(place, thing.quad, scene.grid_from_frame, 1)
-                there = (place > 0) & scene.solid
-                if background.has_left(there):
-                    background.heal(there)
-                    thing.life = Life.OVER
+                _end_left_place(thing, background, scene)
         self._things = [thing for thing in self._things if thing.life is not Life.OVER]
 
     def _is_claimed(self, blob: Blob) -> bool:
@@ -210,14 +217,16 @@ class AutoTargets:
             if thing.life in (Life.SEEN, Life.CARRIED)
         )
 
-    def _confirm(self, frame_px: float) -> None:
+    def _confirm(self, background: BackgroundModel, scene: Scene, moment: _Moment) -> None:
         """Name the things that have been seen often enough and have moved."""
         least = max(_LEAST_HITS, round(_CONFIRMED_S / self._step_s))
         named = sum(thing.life is not Life.NEW for thing in self._things)
         for thing in self._things:
             if thing.life is not Life.NEW or thing.misses or thing.hits < least:
                 continue
-            if named >= _MOST_TARGETS or not _has_moved(thing, frame_px):
+            if named >= _MOST_TARGETS or not _has_moved(thing, moment.grid_px):
+                continue
+            if _end_left_place(thing, background, scene):
                 continue
             thing.life, thing.name, named = Life.SEEN, self._next_name(), named + 1
             thing.home = thing.box.copy()
@@ -229,13 +238,17 @@ class AutoTargets:
             if name not in self._taken:
                 return name
 
-    def _drop_duplicates(self) -> None:
-        """Of two things at one place the one that was seen for longer is right."""
+    def _drop_duplicates(self, moment: _Moment) -> None:
+        """Of two things at one place, moving alike, the one that was seen for longer is right."""
         named = [thing for thing in self._things if thing.life in (Life.SEEN, Life.CARRIED)]
         named.sort(key=lambda thing: -thing.hits)
         for index, thing in enumerate(named):
             for younger in named[index + 1 :]:
-                if overlap(thing.box, younger.box)[0] > _DUPLICATE_OVERLAP:
+                common, inside = overlap(younger.box, thing.box)
+                is_same = common > _DUPLICATE_OVERLAP or (
+                    inside > _DUPLICATE_OVERLAP and _is_alike(thing, younger, moment)
+                )
+                if is_same:
                     younger.life = Life.OVER
         self._things = [thing for thing in self._things if thing.life is not Life.OVER]
 
@@ -244,11 +257,12 @@ class AutoTargets:
         mask = np.zeros(seen.clear.shape, np.uint8)
         for thing in self._things:
             if thing.life in (Life.SEEN, Life.CARRIED):
-                _fill(mask, thing.quad, seen.grid_from_frame, 1)
+                fill(mask, thing.quad, seen.grid_from_frame, 1)
         return mask > 0
 
     def _blind(self, reason: str) -> list[Track]:
         """A frame in which nothing can be seen: the targets are lost, or end."""
+        self.blobs = ()
         for thing in self._things:
             if thing.life is not Life.NEW:
                 thing.life, thing.reason = Life.LOST, reason
@@ -282,7 +296,9 @@ class AutoTargets:
 
     def _track(self, thing: Followed, box: Doubles) -> Track:
         if thing.life is Life.LOST:
-            return Track(thing.name, TrackState.LOST, means="motion", reason=thing.reason)
+            return Track(
+                thing.name, TrackState.LOST, means="motion", reason=thing.reason, is_found=True
+            )
         assert thing.home is not None
         x0, y0, x1, y1 = box
         return Track(
@@ -292,7 +308,20 @@ class AutoTargets:
             frame_from_template=_box_from_box(box, thing.home),
             model=Model.AFFINE,
             means="motion" if thing.life is Life.SEEN else "carried",
+            is_found=True,
         )
+
+
+def _end_left_place(thing: Followed, background: BackgroundModel, scene: Scene) -> bool:
+    """End a thing if it only marks the place that something left, and heal the background."""
+    place = np.zeros(scene.solid.shape, np.uint8)
+    fill(place, thing.quad, scene.grid_from_frame, 1)
+    there = (place > 0) & scene.solid
+    if not background.has_left(there):
+        return False
+    background.heal(there)
+    thing.life = Life.OVER
+    return True
 
 
 def _own_things(things: Sequence[Followed], moment: _Moment) -> list[Followed]:
@@ -302,19 +331,21 @@ def _own_things(things: Sequence[Followed], moment: _Moment) -> list[Followed]:
     """
     elders = [thing for thing in things if thing.hits >= _ELDER_HITS]
     first = max(things, key=lambda thing: thing.hits)
-    most_px = _ALIKE_PX * moment.grid_px
     others = [
-        thing
-        for thing in things
-        if thing not in elders
-        and float(np.hypot(*(thing.velocity - first.velocity))) * moment.step_s > most_px
+        thing for thing in things if thing not in elders and not _is_alike(thing, first, moment)
     ]
     return [*(elders or [first]), *(thing for thing in others if thing is not first)]
 
 
+def _is_alike(one: Followed, other: Followed, moment: _Moment) -> bool:
+    """Do two things move as parts of one would?"""
+    apart = float(np.hypot(*(one.velocity - other.velocity))) * moment.step_s
+    return apart <= _ALIKE_PX * moment.grid_px
+
+
 def _carry(thing: Followed, scene: Scene, moment: _Moment) -> float:
     """Move a thing as the pixels in its place do; the share of it that stands out."""
-    found = _motion_within(scene, thing.box)
+    found = motion_within(scene, thing.box)
     if found is None:
         return 0.0
     moved, share = found
@@ -333,70 +364,6 @@ def _is_over(thing: Followed, size_wh: Size) -> bool:
     edges = touched_edges(thing.box, size_wh)
     outward = np.concatenate([thing.velocity < 0, thing.velocity > 0])
     return is_outside or bool((edges & outward).any()) or thing.lost_s > _COAST_S
-
-
-def _reduced(view: FrameView) -> tuple[Image, Matrix]:
-    """The frame in colour at about `_WIDTH_PX`, and small_from_frame."""
-    width, height = view.size_wh
-    step = max(1, round(max(width, height) / _WIDTH_PX))
-    size = max(1, width // step), max(1, height // step)
-    image = view.frame.image
-    if image.ndim == 2:
-        image = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
-    if step > 1:
-        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return image, geometry.scaling(size[0] / width, size[1] / height)
-
-
-def _is_invertible(matrix: Matrix) -> bool:
-    try:
-        return bool(np.isfinite(geometry.inverted(matrix)).all())
-    except np.linalg.LinAlgError:
-        return False
-
-
-def _moving(scene: Scene) -> Mask:
-    """Which pixels (h, w) of the grid are not at rest against the background."""
-    if scene.motion is None:
-        return np.zeros(scene.solid.shape, np.bool_)
-    x, y = cv2.split(scene.motion)
-    return np.asarray(cv2.magnitude(x, y) > _REST_PX, np.bool_)
-
-
-def _hidden(seen: Outstanding, given: Sequence[Track]) -> Mask:
-    """The places of the targets that were given."""
-    mask = np.zeros(seen.clear.shape, np.uint8)
-    for track in given:
-        if track.quad is not None and np.isfinite(track.quad).all():
-            middle = track.quad.mean(axis=0)
-            _fill(mask, middle + np.float32(1.15) * (track.quad - middle), seen.grid_from_frame, 1)
-    return mask > 0
-
-
-def _fill(mask: Image, quad: npt.NDArray[np.float32], grid_from_frame: Matrix, value: int) -> None:
-    outline = geometry.transform_points(grid_from_frame, quad)
-    if np.isfinite(outline).all():
-        cv2.fillConvexPoly(mask, np.rint(np.clip(outline, -1e5, 1e5)).astype(np.int32), value)
-
-
-def _motion_within(scene: Scene, box: Doubles) -> tuple[Doubles, float] | None:
-    """Median motion (2,), frame px, of what stands out within a box, and its share of the box."""
-    if scene.motion is None:
-        return None
-    corners = geometry.transform_points(scene.grid_from_frame, box.reshape(2, 2))
-    height, width = scene.solid.shape
-    if not np.isfinite(corners).all():
-        return None
-    x0, y0, x1, y1 = np.rint(np.clip(corners.ravel(), -1e5, 1e5)).astype(int).tolist()
-    window = slice(max(0, y0), min(height, y1 + 1)), slice(max(0, x0), min(width, x1 + 1))
-    inside = scene.solid[window]
-    count = int(np.count_nonzero(inside))
-    if count < 6:
-        return None
-    frame_from_grid = geometry.inverted(scene.grid_from_frame)
-    scale = geometry.local_scale(frame_from_grid, corners.mean(axis=0).astype(np.float64))
-    moved = np.median(scene.motion[window][inside], axis=0).astype(np.float64) * scale
-    return moved, count / max(1, (x1 - x0 + 1) * (y1 - y0 + 1))
 
 
 def _hold_to_edges(things: Sequence[Followed], blob: Blob) -> None:
@@ -418,7 +385,7 @@ def _has_moved(thing: Followed, frame_px: float) -> bool:
         return False
     if far < _STRAIGHT_SHARE * thing.path_px:
         return False
-    if thing.flow_px is None:
+    if thing.flow_px is None or far >= _FAR_SHARE * float(np.hypot(*thing.size)):
         return True
     return float(thing.flow_px @ moved) >= _FLOWED_SHARE * far * far
 

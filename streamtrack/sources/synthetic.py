@@ -5,8 +5,9 @@ same URI always gives the same bytes. Parameters: ``seed``, ``frames``, ``size``
 fraction as 30000/1001), ``noise`` (standard deviation of each channel in grey levels), ``blur``
 (exposure as a share of the time between frames, 0..1), ``light`` (strength of changes of light,
 0..1), ``occluders`` (how many), ``image`` (a picture of yours as the target's texture, or as the
-land of ``flight``), ``texture`` (one of the painted kinds) and, for ``flight``, ``step`` (px a
-frame).
+land of ``flight``), ``texture`` (one of the painted kinds), for ``flight`` ``step`` (px a frame),
+and for ``traffic`` ``cars`` (how many come by) and ``camera`` (``fixed`` or ``moving``); there
+``occluders`` are footbridges.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ D = TypeVar("D")
 PREFIX = "synthetic://"
 PARAMETERS = (
     *("seed", "frames", "size", "fps", "noise", "blur", "light", "occluders"),
-    *("image", "texture", "step"),
+    *("image", "texture", "step", "cars", "camera"),
 )
 BLUR_STEP_PX = 1.5
 MOST_RENDERS = 40
@@ -54,6 +55,15 @@ class Truth:
     quad: Points
     frame_from_target: Matrix
     world_from_frame: Matrix
+    visible_share: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ThingTruth:
+    """One of the things that move in a scene: its number there, quad (4, 2) and visible share."""
+
+    number: int
+    quad: Points
     visible_share: float
 
 
@@ -131,6 +141,17 @@ class SyntheticSource:
             world_from_frame=self.scene.world_from_frame(index),
             visible_share=self.scene.visible_share(index),
         )
+
+    def things(self, index: int) -> tuple[ThingTruth, ...]:
+        """All that moves by itself and is in view, the target among it. Raises IndexError."""
+        self._check(index)
+        found = []
+        for number, layer in enumerate(self.scene.things()):
+            share = self.scene.thing_visible_share(number, index)
+            if share > 0:
+                quad = transform_points(layer.frame_from_sprite(index), layer.sprite.quad)
+                found.append(ThingTruth(number, quad, share))
+        return tuple(found)
 
     def frame(self, index: int) -> Frame:
         """Render one frame, whatever was rendered before. Raises IndexError if out of range."""
@@ -260,7 +281,10 @@ def _request(name: str, options: Mapping[str, str]) -> Request:
         raise UsageError(f"step belongs to the scene flight, not to {name}: leave it out")
     if "texture" in options and name not in RECIPES:
         raise UsageError(f"the scene {name} takes no texture=: leave it out or use image=PHOTO")
-    if options.get("occluders", "0") != "0" and name not in RECIPES:
+    for key in ("cars", "camera"):
+        if key in options and name != "traffic":
+            raise UsageError(f"{key} belongs to the scene traffic, not to {name}: leave it out")
+    if options.get("occluders", "0") != "0" and name not in (*RECIPES, "traffic"):
         raise UsageError(f"the scene {name} takes no occluders: leave it out")
     if "texture" in options and options["texture"] not in TEXTURES:
         raise unknown_name("texture", options["texture"], TEXTURES)
@@ -276,6 +300,8 @@ def _request(name: str, options: Mapping[str, str]) -> Request:
         image=_read(options, "image", _photo, None),
         texture=options.get("texture"),
         step=_read(options, "step", _real(0.5, 400.0), 27.0),
+        cars=_read(options, "cars", _whole(1, 200), 12),
+        camera=_read(options, "camera", _camera, "fixed"),
     )
 
 
@@ -308,6 +334,12 @@ def _real(low: float, high: float) -> Callable[[str], float]:
         return value
 
     return parse
+
+
+def _camera(text: str) -> str:
+    if text not in ("fixed", "moving"):
+        raise ValueError("give fixed or moving")
+    return text
 
 
 def _rate(text: str) -> Fraction:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 
 import cv2
@@ -23,7 +23,7 @@ from streamtrack.sources.motion import (
     wander,
 )
 from streamtrack.sources.rendering import Ground, Sprite, premultiplied
-from streamtrack.sources.scenes import circuit, desk, prints, roadside, terrain
+from streamtrack.sources.scenes import circuit, desk, prints, roadside, terrain, traffic
 from streamtrack.sources.scenes.scene import Layer, Light, Pass, Passing, Scene
 from streamtrack.sources.travel import MatrixAt, drive, flight_view
 from streamtrack.types import Image, Matrix, Points, Size
@@ -60,6 +60,8 @@ class Request:
     image: Image | None
     texture: str | None
     step: float
+    cars: int = 12
+    camera: str = "fixed"
 
 
 GENTLY = Reach()
@@ -121,7 +123,7 @@ RECIPES: Mapping[str, Recipe] = {
     "static": Recipe(STILL, noise=3.0),
     "light": Recipe(Reach(0.06, (0.9, 1.1), 10.0, 10.0), light=0.5),
 }
-SCENES = ("board", "car", "flight", *(name for name in RECIPES if name != "board"))
+SCENES = ("board", "car", "flight", "traffic", *(name for name in RECIPES if name != "board"))
 
 
 def build(request: Request) -> Scene:
@@ -130,6 +132,8 @@ def build(request: Request) -> Scene:
         return _flight(request)
     if request.scene == "car":
         return _car(request)
+    if request.scene == "traffic":
+        return _traffic(request)
     return _before_desk(RECIPES[request.scene], request)
 
 
@@ -276,6 +280,23 @@ def _car(request: Request) -> Scene:
     road_rng = stream(request.seed, "road")
     ground = cache(lambda: roadside.paint_road(road_rng, height, lane_px, reach))
     return _travelling(request, ground, plan.frame_from_ground, frame_from_target, sprite)
+
+
+def _traffic(request: Request) -> Scene:
+    """Cars on a road from above, and a camera that stands or goes along it."""
+    size_wh = request.size_wh
+    lane_px = max(round(0.105 * min(size_wh)), 16)
+    reach = math.ceil(1.25 * math.hypot(*size_wh)) + 40
+    height = max(reach, 4 * lane_px + 400)
+    road = traffic.Road(height / 2.0, lane_px)
+    view = traffic.camera_over(request.seed, size_wh, road, request.camera == "moving")
+    cars = traffic.cars_on(request.seed, road, request.frames, size_wh, view, request.cars)
+    bridges = traffic.bridges_over(request.seed, road, size_wh, view, request.occluders or 0)
+    road_rng = stream(request.seed, "road")
+    ground = cache(lambda: roadside.paint_road(road_rng, height, lane_px, reach))
+    first = cars[0]
+    scene = _travelling(request, ground, view, first.frame_from_sprite, first.sprite)
+    return replace(scene, others=cars[1:], occluders=tuple(bridges))
 
 
 def _flight(request: Request) -> Scene:

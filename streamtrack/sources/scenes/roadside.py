@@ -108,6 +108,17 @@ def _beside(wide: Image, rng: np.random.Generator, middle: int, half: int, margi
     return np.ascontiguousarray(wide[:, : PERIOD + margin])
 
 
+def paint_bridge(rng: np.random.Generator, size_wh: Size) -> Image:
+    """Premultiplied BGRA of a footbridge from above, planks between two railings."""
+    width, height = size_wh
+    deck = tinted(plain(size_wh, varied(rng, (120, 138, 150), 10)), cloud(rng, size_wh, 24, 3), 12)
+    for y in range(0, height, 9):
+        box(deck, 0, y, width, 2, (78, 90, 100))
+    for x in (0, width - 5):
+        box(deck, x, 0, 5, height, (60, 64, 70))
+    return premultiplied(deck)
+
+
 def paint_car(rng: np.random.Generator) -> Image:
     """Premultiplied BGRA of a car from above, its nose to the right, its box filled to the rim."""
     width, height = CAR_SIZE

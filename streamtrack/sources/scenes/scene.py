@@ -34,7 +34,8 @@ class Scene:
 
     The backdrop, painted when first asked for, is a picture of the size of the frame if the camera
     is fixed, else a ground with its view. ``target`` is None where the target is part of the
-    ground. ``exposure`` is a share of the time between frames.
+    ground; ``others`` are further things that move, over the target and below the occluders.
+    ``exposure`` is a share of the time between frames.
     """
 
     size_wh: Size
@@ -47,6 +48,7 @@ class Scene:
     light: Light | None
     exposure: float
     noise: float
+    others: tuple[Layer, ...] = ()
 
     def world_from_frame(self, n: float) -> Matrix:
         """World is the pixel frame of frame 0."""
@@ -57,20 +59,35 @@ class Scene:
 
     def layers(self) -> tuple[Layer, ...]:
         """What lies over the backdrop, from the bottom up."""
+        return (*self.things(), *self.occluders)
+
+    def things(self) -> tuple[Layer, ...]:
+        """What moves by itself and is no mere occluder: the target, then the others."""
         if self.target is None:
-            return self.occluders
-        return (Layer(self.target, self.frame_from_target), *self.occluders)
+            return self.others
+        return (Layer(self.target, self.frame_from_target), *self.others)
 
     def visible_share(self, n: float) -> float:
         """Share of the target's area in the frame that is in view and not occluded."""
-        frame_from_target = self.frame_from_target(n)
-        quad = transform_points(frame_from_target, self.target_quad)
-        in_view = geometry.visible_share(quad, self.size_wh)
-        if not self.occluders or in_view == 0:
+        above = (*self.others, *self.occluders)
+        return self._shown(self.frame_from_target, self.target_quad, above, n)
+
+    def thing_visible_share(self, thing: int, n: float) -> float:
+        """The same of one of the `things`."""
+        layers = self.layers()
+        layer = layers[thing]
+        return self._shown(layer.frame_from_sprite, layer.sprite.quad, layers[thing + 1 :], n)
+
+    def _shown(
+        self, frame_from_thing: MatrixAt, own_quad: Points, above: tuple[Layer, ...], n: float
+    ) -> float:
+        matrix = frame_from_thing(n)
+        in_view = geometry.visible_share(transform_points(matrix, own_quad), self.size_wh)
+        if not above or in_view == 0:
             return in_view
-        points, weights = _weighted_grid(self.target_quad, frame_from_target)
+        points, weights = _weighted_grid(own_quad, matrix)
         inside = (points > -0.5) & (points < np.array(self.size_wh) - 0.5)
-        is_hidden = covered(self.occluders, points, n) & inside.all(axis=1)
+        is_hidden = covered(above, points, n) & inside.all(axis=1)
         return max(in_view - float(weights[is_hidden].sum()), 0.0)
 
 

@@ -1,0 +1,96 @@
+"""Places in the background's grid: the reduced frame, what moves in it, and what lies where."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from streamtrack import geometry
+from streamtrack.auto.background import Outstanding
+from streamtrack.auto.blobs import Scene
+from streamtrack.frame_view import FrameView
+from streamtrack.types import Image, Mask, Matrix, Track
+
+Doubles: TypeAlias = npt.NDArray[np.float64]
+
+_WIDTH_PX = 320
+REST_PX = 0.4  # grid pixels a frame, below which something stands
+_CHANGE_FACTOR = 4.0  # of the noise, by which a pixel differs from the frame before
+
+
+def reduced(view: FrameView) -> tuple[Image, Matrix]:
+    """The frame in colour at about `_WIDTH_PX`, and small_from_frame."""
+    width, height = view.size_wh
+    step = max(1, round(max(width, height) / _WIDTH_PX))
+    size = max(1, width // step), max(1, height // step)
+    image = view.frame.image
+    if image.ndim == 2:
+        image = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
+    if step > 1:
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return image, geometry.scaling(size[0] / width, size[1] / height)
+
+
+def is_invertible(matrix: Matrix) -> bool:
+    try:
+        return bool(np.isfinite(geometry.inverted(matrix)).all())
+    except np.linalg.LinAlgError:
+        return False
+
+
+def moving_pixels(seen: Outstanding, motion: npt.NDArray[np.float32] | None) -> tuple[Mask, Mask]:
+    """Which pixels (h, w) of the grid are not at rest against the background."""
+    before = seen.grey_before
+    if motion is None or before is None:
+        nothing = np.zeros(seen.clear.shape, np.bool_)
+        return nothing, nothing
+    x, y = cv2.split(motion)
+    flows = np.asarray(cv2.magnitude(x, y) > REST_PX, np.bool_)
+    change = cv2.absdiff(seen.grey, before)
+    change[~seen.comparable] = 0
+    limit = _CHANGE_FACTOR * max(1.0, 1.4826 * float(np.median(change[::3, ::3])))
+    changed = cv2.medianBlur((change > limit).astype(np.uint8), 3)
+    flows &= seen.comparable
+    around = cv2.dilate(changed, np.ones((9, 9), np.uint8)) > 0
+    within = cv2.morphologyEx(changed, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)) > 0
+    return flows & around, flows & within
+
+
+def hidden_by(seen: Outstanding, given: Sequence[Track]) -> Mask:
+    """The places of the targets that were given."""
+    mask = np.zeros(seen.clear.shape, np.uint8)
+    for track in given:
+        if track.quad is not None and np.isfinite(track.quad).all():
+            middle = track.quad.mean(axis=0)
+            fill(mask, middle + np.float32(1.15) * (track.quad - middle), seen.grid_from_frame, 1)
+    return mask > 0
+
+
+def fill(mask: Image, quad: npt.NDArray[np.float32], grid_from_frame: Matrix, value: int) -> None:
+    outline = geometry.transform_points(grid_from_frame, quad)
+    if np.isfinite(outline).all():
+        cv2.fillConvexPoly(mask, np.rint(np.clip(outline, -1e5, 1e5)).astype(np.int32), value)
+
+
+def motion_within(scene: Scene, box: Doubles) -> tuple[Doubles, float] | None:
+    """Median motion (2,), frame px, of what stands out within a box, and its share of the box."""
+    if scene.motion is None:
+        return None
+    corners = geometry.transform_points(scene.grid_from_frame, box.reshape(2, 2))
+    height, width = scene.solid.shape
+    if not np.isfinite(corners).all():
+        return None
+    x0, y0, x1, y1 = np.rint(np.clip(corners.ravel(), -1e5, 1e5)).astype(int).tolist()
+    window = slice(max(0, y0), min(height, y1 + 1)), slice(max(0, x0), min(width, x1 + 1))
+    inside = scene.solid[window]
+    count = int(np.count_nonzero(inside))
+    if count < 6:
+        return None
+    frame_from_grid = geometry.inverted(scene.grid_from_frame)
+    scale = geometry.local_scale(frame_from_grid, corners.mean(axis=0).astype(np.float64))
+    moved = np.median(scene.motion[window][inside], axis=0).astype(np.float64) * scale
+    return moved, count / max(1, (x1 - x0 + 1) * (y1 - y0 + 1))

@@ -29,7 +29,7 @@ class Flatness:
 
     def learn(self, frame_from_template: Matrix, share: float) -> None:
         """Take in a pose with which a ``share`` (0..1) of the points in view agree."""
-        if self.is_proven:
+        if self.is_proven or share < _FLAT_IF[-1][0]:
             return
         seen_from = slant(frame_from_template, self._quad)
         self._frames += any(share >= least and seen_from >= far for least, far in _FLAT_IF)

@@ -164,6 +164,8 @@ class FlowAligner:
         registration = found.registration
         if registration.b_from_a is None or registration.model is None:
             return found
+        if registration.inliers > _CLEAR * len(found.is_in_view):
+            prior = None  # seen all around: it would change nothing
         pose = refined(
             lambda pose: view.pyramid.warped(pose @ patch.template_from_patch, patch.size_wh),
             registration.b_from_a,
@@ -171,7 +173,7 @@ class FlowAligner:
             patch.gradients,
             self._shown(patch, found),
             registration.model,
-            None if prior is None else prior.against(float(np.mean(registration.is_inlier))),
+            None if prior is None else prior.against(agreeing_share(found)),
         )
         if pose is None or judge_mapping(pose, self._template.quad) is not Verdict.OK:
             pose = registration.b_from_a
@@ -308,7 +310,7 @@ def agreeing_share(alignment: Alignment) -> float:
     found = alignment.registration
     if found.b_from_a is None or not len(found.is_inlier):
         return 0.0
-    return float(np.mean(found.is_inlier))
+    return found.inliers / len(found.is_inlier)
 
 
 def _near(patch: Patch, rows: Mask) -> Mask:
@@ -322,7 +324,7 @@ def _near(patch: Patch, rows: Mask) -> Mask:
 
 def patch_for(template: Template, frame_from_template: Matrix) -> int:
     """Index of the patch whose resolution fits the target's size in the frame."""
-    magnification = geometry.local_scale(frame_from_template, template.quad.mean(axis=0))
+    magnification = geometry.local_scale(frame_from_template, template.centre)
     for i, patch in enumerate(template.patches):
         if patch.scale <= 1.2 * magnification:
             return i
@@ -334,7 +336,7 @@ def _make_flow() -> cv2.DISOpticalFlow:
     flow.setFinestScale(1)
     flow.setPatchSize(8)
     flow.setPatchStride(4)
-    flow.setGradientDescentIterations(16)
+    flow.setGradientDescentIterations(10)
     flow.setVariationalRefinementIterations(0)
     return flow
 

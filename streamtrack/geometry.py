@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import copysign, inf, isfinite, nan, sqrt
+from math import inf, isfinite, sqrt
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from streamtrack.types import Image, Matrix, Points, Size
 
 _FEW = 8
-_LARGEST = float(np.finfo(np.float32).max)
+_NEAR_HORIZON = 1e-20
 
 
 def transform_points(b_from_a: Matrix, points: npt.ArrayLike) -> Points:
@@ -20,9 +20,17 @@ def transform_points(b_from_a: Matrix, points: npt.ArrayLike) -> Points:
     Points on the horizon come out as inf or NaN; `registration.judge_mapping` refuses those.
     """
     pts = np.asarray(points).reshape(-1, 2)
-    if len(pts) <= _FEW:
-        return _few_transformed(b_from_a, pts)
     (a, b, c), (d, e, f), (g, h, i) = b_from_a.tolist()
+    if len(pts) <= _FEW:
+        # Without numpy's overhead, which for the corners of a quad is nearly all there is.
+        corners = pts.tolist()
+        depths = [g * x + h * y + i for x, y in corners]
+        if all(abs(depth) > _NEAR_HORIZON for depth in depths):
+            mapped = [
+                ((a * x + b * y + c) / depth, (d * x + e * y + f) / depth)
+                for (x, y), depth in zip(corners, depths, strict=True)
+            ]
+            return np.array(mapped, np.float32).reshape(-1, 2)
     x, y = np.ascontiguousarray(pts.T, np.float64)
     result: Points = np.empty((len(pts), 2), np.float32)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -30,23 +38,6 @@ def transform_points(b_from_a: Matrix, points: npt.ArrayLike) -> Points:
         result[:, 0] = (a * x + b * y + c) / depth
         result[:, 1] = (d * x + e * y + f) / depth
     return result
-
-
-def _few_transformed(b_from_a: Matrix, points: npt.NDArray[Any]) -> Points:
-    """The same without numpy's overhead, which for the corners of a quad is nearly all there is."""
-    (a, b, c), (d, e, f), (g, h, i) = b_from_a.tolist()
-    mapped = []
-    for x, y in points.tolist():
-        depth = g * x + h * y + i
-        u, v = a * x + b * y + c, d * x + e * y + f
-        mapped.append((_ratio(u, depth), _ratio(v, depth)))
-    return np.array(mapped, np.float32).reshape(-1, 2)
-
-
-def _ratio(a: float, b: float) -> float:
-    """a / b as numpy's float32 has it: infinite where too large, NaN for 0 / 0."""
-    ratio = a / b if b else (a * inf if a else nan)
-    return ratio if abs(ratio) < _LARGEST or ratio != ratio else copysign(inf, ratio)
 
 
 def projective_depths(b_from_a: Matrix, points: npt.ArrayLike) -> npt.NDArray[np.float64]:

@@ -22,6 +22,8 @@ CORRELATION_WINDOW = 11
 """Patch pixels."""
 _MAX_ENLARGEMENT = 2.0
 _SCALE_STEP = 2**-0.5
+_MOST_SCALES = 12
+_PASSING_SCALES = 4
 _MIN_PATCH_SIDE_PX = 28
 _FLOW_POINTS = 260
 MIN_FLOW_POINTS = 12
@@ -88,6 +90,12 @@ class Template:
     patches: tuple[Patch, ...]
     features: Features
 
+    @property
+    def centre(self) -> npt.NDArray[np.float32]:
+        """Mean of the corners (2,)."""
+        (ax, ay), (bx, by), (cx, cy), (dx, dy) = self.quad.tolist()
+        return np.array([(ax + bx + cx + dx) / 4, (ay + by + cy + dy) / 4], np.float32)
+
 
 def make_template(name: str, picture: Image, quad: Points, extractor: FeatureExtractor) -> Template:
     """The template of ``quad`` in ``picture`` (BGR or grey).
@@ -106,18 +114,29 @@ def make_template(name: str, picture: Image, quad: Points, extractor: FeatureExt
     return Template(name, picture, quad, patches, features)
 
 
-def make_patches(grey: Image, quad: Points, shown: Points | None = None) -> tuple[Patch, ...]:
-    """The target inside ``quad`` of a grey picture (H, W) at all its scales, finest first.
+def make_patches(grey: Image, quad: Points) -> tuple[Patch, ...]:
+    """The target inside ``quad`` of a grey picture (H, W) at all its scales, finest first."""
+    return _patches(grey, quad, None, _MAX_ENLARGEMENT, _MOST_SCALES)
 
-    ``shown`` (N, 2), if given, limits what is compared to the surroundings of these points.
+
+def make_passing_patches(grey: Image, quad: Points, shown: Points) -> tuple[Patch, ...]:
+    """The same at the few scales needed as long as the target's size hardly changes.
+
+    Only the surroundings of ``shown`` (N, 2) are compared.
     """
+    return _patches(grey, quad, shown, 1.0, _PASSING_SCALES)
+
+
+def _patches(
+    grey: Image, quad: Points, shown: Points | None, finest: float, most: int
+) -> tuple[Patch, ...]:
     x0, y0, x1, y1 = geometry.bounding_box(quad)
     margin = max(2.0, _MARGIN_SHARE * max(x1 - x0, y1 - y0))
     x0, y0, x1, y1 = x0 - margin, y0 - margin, x1 + margin, y1 + margin
-    finest = min(_MAX_ENLARGEMENT, (PATCH_AREA_PX / ((x1 - x0) * (y1 - y0))) ** 0.5)
+    finest = min(finest, (PATCH_AREA_PX / ((x1 - x0) * (y1 - y0))) ** 0.5)
     pyramid = Pyramid(grey)
     patches: list[Patch] = []
-    for step in range(12):
+    for step in range(most):
         scale = finest * _SCALE_STEP**step
         size = round((x1 - x0) * scale), round((y1 - y0) * scale)
         if min(size) < _MIN_PATCH_SIDE_PX and patches:

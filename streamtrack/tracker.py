@@ -10,6 +10,7 @@ neither ever repeats an old quad.
 from __future__ import annotations
 
 from dataclasses import replace
+from math import sqrt
 from typing import Protocol
 
 import numpy as np
@@ -40,7 +41,7 @@ from streamtrack.types import (
     TrackState,
     Verdict,
 )
-from streamtrack.views import RecentViews
+from streamtrack.views import MIN_VIEW_SHARE, RecentViews
 
 _GUIDED_RADIUS_PX = 60.0
 _COAST_FRAMES = 10  # lost frames in which the last pose is still tried
@@ -57,7 +58,7 @@ _LEAST_HOPED_SHARE = 0.35
 _SHARE_KEPT = 0.85  # of the last frame's, where less agree of what is flat: an occluder stays
 _SURPRISE_RATE = 0.2  # share of a new frame's surprise in the running mean
 _CLEAR_VIEW_SHARE = 0.5  # inliers of all points, below which a frame teaches no surprise
-_MIN_VIEW_SHARE = 0.6  # of the points of a recent view
+_REMEMBERED_SHARE = 0.4  # of the points in view, for a frame to be a recent view
 _VIEW_ADVANTAGE = 0.3  # in share of points, of a recent view over the first
 _RENEWED_BELOW_SHARE = 0.75
 _FRAMES_BETWEEN_VIEWS = 4  # after a view that did not help
@@ -126,13 +127,16 @@ class HybridTracker:
         )
 
     def update(self, view: FrameView) -> Track:
+        was_in_view = self._is_in_view
         followed = self._follow(view)
         recent = self._follow_views(view, followed)
         if recent is not None:
             return self._tracked(recent, "view")
+        if was_in_view and followed is not None and followed.registration.b_from_a is None:
+            followed = self._follow(view)
         if followed is not None and followed.registration.b_from_a is not None:
             self._flatness.learn(followed.registration.b_from_a, agreeing_share(followed))
-            if self._flatness.is_proven or agreeing_share(followed) >= _CLEAR_VIEW_SHARE:
+            if self._flatness.is_proven or agreeing_share(followed) >= _REMEMBERED_SHARE:
                 self._views.remember(view, followed)
             return self._tracked(followed, "flow")
         self._views.forget()
@@ -141,7 +145,7 @@ class HybridTracker:
         detected, evidence, means = self._detect(view)
         if detected.b_from_a is not None:
             confirmed = self._aligner.align(view, detected.b_from_a)
-            if np.mean(confirmed.registration.is_inlier) < _MIN_RETURN_SHARE:
+            if agreeing_share(confirmed) < _MIN_RETURN_SHARE:
                 confirmed = _refused(confirmed, Verdict.LOW_CORRELATION)
             confirmed = self._with_own_colors(confirmed, view)
             if confirmed.registration.verdict is Verdict.OK:
@@ -194,16 +198,14 @@ class HybridTracker:
     def _align_first(self, view: FrameView, guess: Matrix) -> Alignment:
         """The first view in the frame: near the guess if that should be good, else farther off.
 
-        While a recent view carries a flat target, the first is only tried for its return.
+        While a recent view carries the target, the first is only tried for its return.
         """
         if self._frames_lost:
             return self._aligner.align(view, guess)
-        hope = self._hope(guess)
+        hope = Hope(_CLEAR_VIEW_SHARE, 0.0) if self._is_in_view else self._hope(guess)
         if hope is not None:
             near = self._aligner.align_near(view, guess, hope, self._surprise_px)
-            if near.registration.b_from_a is not None or (
-                self._is_in_view and self._flatness.is_proven
-            ):
+            if near.registration.b_from_a is not None or self._is_in_view:
                 return near
         return self._aligner.align(view, guess, self._surprise_px)
 
@@ -218,7 +220,7 @@ class HybridTracker:
             return None
         if self._flatness.is_proven and followed.registration.b_from_a is not None:
             return None
-        if self._frames_to_next_view:
+        if self._frames_to_next_view and followed.registration.b_from_a is not None:
             self._frames_to_next_view -= 1
             return None
         guess = self._pose if self._step_pose is None else self._step_pose @ self._pose
@@ -229,8 +231,8 @@ class HybridTracker:
             return None
         recent = self._with_own_colors(self._plausible(recent, guess), view)
         share = agreeing_share(recent)
-        needed = _MIN_VIEW_SHARE if self._is_in_view else first_share + _VIEW_ADVANTAGE
-        self._is_in_view = share >= max(_MIN_VIEW_SHARE, needed)
+        needed = MIN_VIEW_SHARE if self._is_in_view else first_share + _VIEW_ADVANTAGE
+        self._is_in_view = share >= max(MIN_VIEW_SHARE, needed)
         if not self._is_in_view:
             self._frames_to_next_view = _FRAMES_BETWEEN_VIEWS
             return None
@@ -261,7 +263,7 @@ class HybridTracker:
         ) / geometry.signed_area(geometry.transform_points(guess, quad))
         if not 1 / _MAX_AREA_JUMP <= area_ratio <= _MAX_AREA_JUMP:
             verdict = Verdict.AREA
-        elif self._frames_lost and np.mean(found.is_inlier) < _MIN_RETURN_SHARE:
+        elif self._frames_lost and agreeing_share(alignment) < _MIN_RETURN_SHARE:
             verdict = Verdict.LOW_CORRELATION
         return alignment if verdict is Verdict.OK else _refused(alignment, verdict)
 
@@ -317,7 +319,7 @@ class HybridTracker:
         else:
             self._step_pose = None
             self._doubt_px = 0.0
-            share = float(np.mean(found.is_inlier))
+            share = agreeing_share(alignment)
             self._surprise_px = max(self._surprise_px, _FIRST_SURPRISE_PX / max(share, 0.1))
         self._pose = found.b_from_a
         self._last_share = agreeing_share(alignment) if means != "view" else 0.0
@@ -332,7 +334,7 @@ class HybridTracker:
 def _rms_distance_px(one: Matrix, other: Matrix, quad: Points) -> float:
     """How far apart two poses put the quad's corners (4, 2), in frame pixels."""
     apart = geometry.transform_points(one, quad) - geometry.transform_points(other, quad)
-    return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+    return sqrt(float(np.vdot(apart, apart)) / len(quad))
 
 
 def _refused(alignment: Alignment, verdict: Verdict) -> Alignment:

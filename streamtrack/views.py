@@ -14,12 +14,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from streamtrack import geometry
-from streamtrack.flow import Alignment, FlowAligner, Hope
+from streamtrack.flow import Alignment, FlowAligner, Hope, agreeing_share
 from streamtrack.frame_view import FrameView
 from streamtrack.settings import RegistrationSettings
-from streamtrack.template import MIN_FLOW_POINTS, Template, make_patches
-from streamtrack.types import Image, Matrix, Model, Points, Verdict
+from streamtrack.template import MIN_FLOW_POINTS, Template, make_passing_patches
+from streamtrack.types import Image, Matrix, Model, Points
 
+MIN_VIEW_SHARE = 0.6
+"""Share of a recent view's points that must agree."""
 _HOPE = Hope(0.75, 0.0)
 
 
@@ -70,7 +72,7 @@ class RecentViews:
         `FlowAligner.align`.
         """
         aligned = self._align_in_use(view, guess, sigma_px)
-        if aligned is not None and aligned.registration.verdict is Verdict.OK:
+        if aligned is not None and agreeing_share(aligned) >= MIN_VIEW_SHARE:
             return aligned
         if self._newest is None or self._newest is self._in_use:
             return aligned
@@ -86,7 +88,7 @@ class RecentViews:
         assert self._newest is not None
         sight = self._in_use = self._newest
         quad = geometry.transform_points(sight.frame_from_template, self._template.quad)
-        patches = make_patches(sight.grey, quad, sight.shown)
+        patches = make_passing_patches(sight.grey, quad, sight.shown)
         if not patches or len(patches[0].points) < MIN_FLOW_POINTS:
             self._aligner = None
             return

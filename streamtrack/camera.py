@@ -25,8 +25,9 @@ from streamtrack.mosaic.types import Link
 from streamtrack.relocalising import Relocaliser
 from streamtrack.settings import Settings
 from streamtrack.types import CameraPose, Matrix, Model, Points, Size, Track, Verdict
-from streamtrack.view_alignment import ViewAlignment, align, align_exactly
+from streamtrack.view_alignment import align, align_exactly
 from streamtrack.view_levels import ReferenceView, ViewLevels
+from streamtrack.view_verdict import ViewAlignment
 
 _MIN_OVERLAP = 0.6
 _MIN_OVERLAP_UNSHARP = 0.45  # below which a blurred frame, too, becomes a keyframe

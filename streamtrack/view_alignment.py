@@ -7,14 +7,12 @@ every pixel by its gradient, which makes it several times as exact as matched po
 is weak. Light that changes smoothly drops out by a high-pass filter and a gain, moving things by
 Tukey's biweight.
 
-The outcome is judged cell by cell: a cell agrees if its own pixels correlate and would not rather
-lie elsewhere. These cells are the point pairs on which the verdict rests.
+The outcome is judged cell by cell (see `view_verdict`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import cv2
@@ -23,8 +21,9 @@ import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.registration import judge_mapping
-from streamtrack.types import Mask, Matrix, Points, Size, Verdict
+from streamtrack.types import Mask, Matrix, Points, Verdict
 from streamtrack.view_levels import EDGE_PX, EXACT, USUAL, Floats, Pixels, ReferenceView, ViewLevels
+from streamtrack.view_verdict import Fitted, ViewAlignment, judged, refusal
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
@@ -34,20 +33,11 @@ _SAME_PX = 0.5  # of a level: starts that differ by no more lead to the same end
 _MAX_LAST_STEP_PX = 1.0  # of a fit that counts as converged
 _CONVERGED_PX = 0.01
 _CONVERGED_COARSE_PX = 0.15
-_MIN_CELL_PIXELS = 6
 _PERSPECTIVE_SIGMA = 0.05  # of the change against the guess, in units of half a view
 _SHAPE_SIGMA = 0.15
-_MIN_CELLS = 6
-_MIN_AGREEING_SHARE = 0.3
 _MIN_SHAPE_SHARE = 0.6  # of agreeing cells, for a mapping richer than a similarity
 _MIN_STIFF_SHARE = 0.85  # of its agreeing cells that a similarity must keep
 _MAX_STIFF_UNLIKE = 1.25  # and the factor by which they may be less alike
-_MIN_SPREAD_SHARE = 0.08
-_MIN_CELL_CORRELATION = 0.5
-_MIN_CORRELATION = 0.6
-_MAX_CELL_SHIFT_PX = 0.75  # pixels of the usual level
-_MAX_CORNER_SIGMA_PX = 2.0
-_CORRELATED = 3.0  # neighbouring pixels do not err independently: factor on predicted errors
 _SEARCH_SHARE = 0.3  # of the view: how far the search for a shift reaches
 
 _SIMILARITY = np.stack(
@@ -55,35 +45,6 @@ _SIMILARITY = np.stack(
 )
 _AFFINE = np.eye(8)[:, :6]
 _FREEDOMS = (np.eye(8), np.eye(8), _AFFINE, _SIMILARITY, _SIMILARITY)  # by level
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ViewAlignment:
-    """How another view maps into a reference view, with its evidence and its verdict.
-
-    reference_from_view  None unless the verdict is OK
-    reference_points     float32 (M, 2), middles of the reference's cells that both views show
-    view_points          float32 (M, 2), where the alignment takes them in the other view
-    is_inlier            bool (M,), the cell agrees
-    rmse_px              of the shifts that agreeing cells would still like to make, view pixels
-    correlation          normalised cross-correlation of the agreeing cells' pixels, or NaN
-    corner_sigma_px      predicted error of the view's corners, reference pixels, or inf
-    sharpness            gradient energy of the view against the reference's: below 1 if blurred
-    """
-
-    verdict: Verdict
-    reference_from_view: Matrix | None
-    reference_points: Points
-    view_points: Points
-    is_inlier: Mask
-    rmse_px: float = float("nan")
-    correlation: float = float("nan")
-    corner_sigma_px: float = float("inf")
-    sharpness: float = float("nan")
-
-    @property
-    def inliers(self) -> int:
-        return int(np.count_nonzero(self.is_inlier))
 
 
 def align(
@@ -102,13 +63,13 @@ def align(
     try:
         view_from_reference = geometry.inverted(guess)
     except np.linalg.LinAlgError:
-        return _refusal(Verdict.MIRRORED)
+        return refusal(Verdict.MIRRORED)
     if judge_mapping(view_from_reference, geometry.image_quad(reference.size_wh)) is not Verdict.OK:
-        return _refusal(Verdict.PERSPECTIVE)
+        return refusal(Verdict.PERSPECTIVE)
     if is_searched:
         view_from_reference = _shifted(reference, view, view_from_reference)
     last = min(len(reference.levels.images), len(view.images)) - 1
-    fitted: _Fitted | None = None
+    fitted: Fitted | None = None
     start = view_from_reference
     for level in range(last, USUAL - 1, -1):
         if fitted is not None and _differ(view_from_reference, start, view, level):
@@ -117,7 +78,7 @@ def align(
             view_from_reference = max(tried, key=lambda m: _likeness(reference, view, level, m))
         fitted = _fit(reference, view, level, view_from_reference, hidden)
         if fitted is None:
-            return _refusal(Verdict.TOO_FEW_FEATURES if level == USUAL else Verdict.OUT_OF_VIEW)
+            return refusal(Verdict.TOO_FEW_FEATURES if level == USUAL else Verdict.OUT_OF_VIEW)
         view_from_reference = fitted.view_from_reference
     assert fitted is not None
     return _stiffened(reference, view, start, fitted, hidden)
@@ -130,10 +91,10 @@ def align_exactly(
     try:
         start = geometry.inverted(guess)
     except np.linalg.LinAlgError:
-        return _refusal(Verdict.MIRRORED)
+        return refusal(Verdict.MIRRORED)
     fitted = _fit(reference, view, EXACT, start, hidden)
     if fitted is None:
-        return _refusal(Verdict.TOO_FEW_FEATURES)
+        return refusal(Verdict.TOO_FEW_FEATURES)
     return _stiffened(reference, view, start, fitted, hidden)
 
 
@@ -141,14 +102,14 @@ def _stiffened(
     reference: ReferenceView,
     view: ViewLevels,
     start: Matrix,
-    fitted: _Fitted,
+    fitted: Fitted,
     hidden: Sequence[Points],
 ) -> ViewAlignment:
     """The fit judged, or a similarity change of ``start`` where much of the view disagrees.
 
     What moves by itself (water, a herd) then cannot shear or tilt the rest.
     """
-    found = _judged(reference, view, fitted)
+    found = judged(reference, view, fitted)
     agrees = found.inliers >= _MIN_SHAPE_SHARE * len(found.is_inlier)
     if found.verdict is not Verdict.OK or agrees:
         return found
@@ -158,15 +119,10 @@ def _stiffened(
     )
     near = geometry.translation(*(after - before).tolist()) @ start
     poorer = _fit(reference, view, fitted.level, near, hidden, _SIMILARITY)
-    stiff = found if poorer is None else _judged(reference, view, poorer)
+    stiff = found if poorer is None else judged(reference, view, poorer)
     is_as_good = stiff.inliers >= _MIN_STIFF_SHARE * found.inliers
     is_as_good &= 1 - stiff.correlation <= _MAX_STIFF_UNLIKE * (1 - found.correlation)
     return stiff if stiff.verdict is Verdict.OK and is_as_good else found
-
-
-def _refusal(verdict: Verdict) -> ViewAlignment:
-    none = np.zeros((0, 2), np.float32)
-    return ViewAlignment(verdict, None, none, none, np.zeros(0, np.bool_))
 
 
 def _shifted(reference: ReferenceView, view: ViewLevels, view_from_reference: Matrix) -> Matrix:
@@ -204,20 +160,6 @@ def _shifted(reference: ReferenceView, view: ViewLevels, view_from_reference: Ma
     return geometry.normalized(moved)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Fitted:
-    """A fit at one level: the mapping, and the pixels (N,) it rests on."""
-
-    view_from_reference: Matrix
-    level: int
-    pixels: Pixels
-    seen: Floats
-    residual: Floats
-    basis: Doubles
-    normal: Doubles
-    is_settled: bool
-
-
 def _fit(
     reference: ReferenceView,
     view: ViewLevels,
@@ -225,7 +167,7 @@ def _fit(
     start: Matrix,
     hidden: Sequence[Points],
     basis: Doubles | None = None,
-) -> _Fitted | None:
+) -> Fitted | None:
     """Gauss-Newton at one level from ``start`` (view_from_reference), or None."""
     values = view.high_passed(level)
     to_reference, to_view = reference.levels.level_from_view(level), view.level_from_view(level)
@@ -264,7 +206,7 @@ def _fit(
     if not np.isfinite(found).all() or abs(found[2, 2]) < 1e-9:
         return None
     is_settled = moved_px <= _MAX_LAST_STEP_PX
-    return _Fitted(
+    return Fitted(
         geometry.normalized(found), level, pixels, seen, residual, basis, normal, is_settled
     )
 
@@ -372,123 +314,3 @@ def _median_size(values: Floats) -> float:
     middle = len(sizes) // 2
     sizes.partition(middle)
     return float(sizes[middle])
-
-
-# -- the verdict --------------------------------------------------------------------------------
-
-
-def _judged(reference: ReferenceView, view: ViewLevels, fitted: _Fitted) -> ViewAlignment:
-    """The alignment with its cells' evidence, refused with the first reason that applies."""
-    usual_px = view.images[fitted.level].shape[1] / view.images[USUAL].shape[1]
-    cells = _cells(fitted, _MAX_CELL_SHIFT_PX * usual_px)
-    reference_from_level = geometry.inverted(reference.levels.level_from_view(fitted.level))
-    reference_points = geometry.transform_points(reference_from_level, cells.middles)
-    view_points = geometry.transform_points(fitted.view_from_reference, reference_points)
-    view_px = view.size_wh[0] / view.images[fitted.level].shape[1]
-    agreeing = cells.is_agreeing
-    shifts = cells.shifts_px[agreeing]
-    rmse_px = float(np.sqrt(np.mean(shifts**2))) * view_px if len(shifts) else float("nan")
-    found = ViewAlignment(
-        Verdict.OK,
-        None,
-        reference_points,
-        view_points,
-        agreeing,
-        rmse_px,
-        cells.correlation,
-        sharpness=cells.sharpness,
-    )
-    verdict = _support_verdict(found, view)
-    if verdict is not Verdict.OK:
-        return replace(found, verdict=verdict)
-    try:
-        reference_from_view = geometry.inverted(fitted.view_from_reference)
-    except np.linalg.LinAlgError:
-        return replace(found, verdict=Verdict.MIRRORED)
-    sigma_px = _corner_sigma_px(reference, fitted, reference_from_view, view.size_wh)
-    found = replace(found, corner_sigma_px=sigma_px)
-    verdict = judge_mapping(reference_from_view, geometry.image_quad(view.size_wh))
-    is_certain = fitted.is_settled and sigma_px <= _MAX_CORNER_SIGMA_PX
-    if verdict is Verdict.OK and not is_certain:
-        verdict = Verdict.UNCERTAIN
-    if verdict is not Verdict.OK:
-        return replace(found, verdict=verdict)
-    return replace(found, reference_from_view=reference_from_view)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Cells:
-    """Evidence of the cells (M,) that both views show."""
-
-    middles: Doubles
-    shifts_px: Doubles
-    is_agreeing: Mask
-    correlation: float
-    sharpness: float
-
-
-def _cells(fitted: _Fitted, max_shift_px: float) -> _Cells:
-    pixels = fitted.pixels
-    starts = np.flatnonzero(np.diff(pixels.cell, prepend=-1))
-    wanted, got = pixels.values, fitted.seen
-    unit = np.float32(pixels.unit_from_level[0, 0])
-    gx, gy = pixels.jacobian[:, 2] * unit, pixels.jacobian[:, 5] * unit
-    r = fitted.residual
-    x, y, one = pixels.points
-    terms = [one, x, y, wanted, got, wanted * wanted, got * got, wanted * got]
-    terms += [gx * gx, gy * gy, gx * gy, gx * r, gy * r]
-    sums = np.add.reduceat(np.stack(terms), starts, axis=1).astype(np.float64)
-    n, sum_x, sum_y, w, g, ww, gg, wg, xx, yy, xy, rx, ry = sums
-    covariance = wg / n - w * g / n**2
-    variances = np.maximum(ww / n - (w / n) ** 2, 0) * np.maximum(gg / n - (g / n) ** 2, 0)
-    correlation = covariance / np.sqrt(variances + 1e-6)
-    # Shift that would suit the cell's own pixels best, held small where texture says nothing.
-    xx, yy = xx + n, yy + n
-    shift = np.hypot(yy * rx - xy * ry, xx * ry - xy * rx) / (xx * yy - xy * xy)
-    shown = n >= _MIN_CELL_PIXELS
-    agreeing = shown & (correlation >= _MIN_CELL_CORRELATION) & (shift <= max_shift_px)
-    middles = np.stack([sum_x / n, sum_y / n], axis=1)
-    together, ratio = float("nan"), float("nan")
-    if agreeing.any():
-        count, w, g, ww, gg, wg = sums[[0, 3, 4, 5, 6, 7]][:, agreeing].sum(axis=1)
-        variance_w, variance_g = ww / count - (w / count) ** 2, gg / count - (g / count) ** 2
-        together = float((wg / count - w * g / count**2) / np.sqrt(variance_w * variance_g + 1e-9))
-        ratio = float(np.sqrt(variance_g / max(float(variance_w), 1e-9)))
-    return _Cells(middles[shown], shift[shown], agreeing[shown], together, ratio)
-
-
-def _support_verdict(found: ViewAlignment, view: ViewLevels) -> Verdict:
-    shown = len(found.is_inlier)
-    if shown < _MIN_CELLS:
-        return Verdict.TOO_FEW_FEATURES
-    if found.inliers < max(_MIN_CELLS, _MIN_AGREEING_SHARE * shown):
-        return Verdict.TOO_FEW_INLIERS
-    hull = cv2.convexHull(found.view_points[found.is_inlier])
-    share = float(cv2.contourArea(hull)) / (view.size_wh[0] * view.size_wh[1])
-    if share < _MIN_SPREAD_SHARE:
-        return Verdict.NOT_SPREAD
-    if not found.correlation >= _MIN_CORRELATION:
-        return Verdict.LOW_CORRELATION
-    return Verdict.OK
-
-
-def _corner_sigma_px(
-    reference: ReferenceView, fitted: _Fitted, reference_from_view: Matrix, size_wh: Size
-) -> float:
-    """Predicted standard deviation of the view's worst corner, in reference pixels."""
-    corners = geometry.transform_points(reference_from_view, geometry.image_quad(size_wh))
-    to_unit = fitted.pixels.unit_from_level @ reference.levels.level_from_view(fitted.level)
-    unit = geometry.transform_points(to_unit, corners).astype(np.float64)
-    if not np.isfinite(unit).all():
-        return float("inf")
-    x, y = unit.T
-    one, zero = np.ones(4), np.zeros(4)
-    rows_x = np.stack([x, y, one, zero, zero, zero, -x * x, -x * y], axis=1)
-    rows_y = np.stack([zero, zero, zero, x, y, one, -x * y, -y * y], axis=1)
-    try:
-        covariance = fitted.basis @ np.linalg.inv(fitted.normal) @ fitted.basis.T
-    except np.linalg.LinAlgError:
-        return float("inf")
-    variance = np.sum(rows_x @ covariance * rows_x + rows_y @ covariance * rows_y, axis=1)
-    worst = float(np.sqrt(max(float(np.max(variance)), 0.0)))
-    return float(_CORRELATED * worst / to_unit[0, 0])

@@ -162,13 +162,17 @@ class LiveView:
         small = (round(size_wh[0] * self._factor), round(size_wh[1] * self._factor))
         self._put(lambda log: log.log_mosaic_frame(index, time_s, small, pose, state, reason, kept))
 
-    def close(self, summary_markdown: str = "") -> None:
-        """Disconnect all viewers, within about two seconds; closing again does nothing."""
+    def begin_close(self, summary_markdown: str = "") -> None:
+        """Have the last things shown and the server end, without waiting for it."""
         if self._end.is_set():
             return
         self._handler.detach()
         self._put(lambda log: log.close(summary_markdown))
         self._end.set()
+
+    def close(self, summary_markdown: str = "") -> None:
+        """Disconnect all viewers, within about two seconds; closing again does nothing."""
+        self.begin_close(summary_markdown)
         self._thread.join(1.0)
         self._server.kill()  # should the thread be stuck in writing to it
         self._thread.join(1.0)

@@ -138,7 +138,8 @@ def open_watchers(
     if live is not None:
         result.live = LiveWatcher(live, displays)
         result.watchers.append(result.live.watch)
-    result.finishers.extend(_closer(display) for display in displays)
+    # The live view first: it ends by itself while the recording is closed.
+    result.finishers.extend(_closer(display) for display in reversed(displays))
     return result
 
 
@@ -189,7 +190,10 @@ def _open_displays(
 
 
 def _closer(display: Recorder | LiveView) -> Finisher:
-    return lambda summary: display.close(summary.to_markdown())
+    from streamtrack.live_view import LiveView
+
+    close = display.begin_close if isinstance(display, LiveView) else display.close
+    return lambda summary: close(summary.to_markdown())
 
 
 def _add_mosaic(

@@ -311,6 +311,23 @@ def test_a_stream_that_breaks_off_is_opened_again_as_a_new_epoch(
     assert source.drain_events()[-1].state is LiveState.ENDED
 
 
+def test_what_broke_off_is_gone_at_once() -> None:
+    """Not only when garbage is collected: in runs of days that may never happen."""
+
+    def open_device(is_stopping: Callable[[], bool]) -> Device:
+        return Device([captured(1), CaptureEndedError("unplugged")])
+
+    gc.collect()
+    gc.disable()
+    try:
+        with live(opener=open_device) as source:
+            assert eventually(lambda: source.status().openings > 20)
+            kept = [item for item in gc.get_objects() if isinstance(item, Device)]
+            assert len(kept) <= 2
+    finally:
+        gc.enable()
+
+
 def test_a_silent_stream_is_given_up_and_opened_again() -> None:
     first = Device(paced(range(3)))
     with live(first, Device(paced(range(3))), settings={"stall_timeout_s": 0.1}) as source:

@@ -266,6 +266,10 @@ def test_fatal_error_unplugging_and_return_with_another_format(
     assert (result["back"], result["size"]) == ("320x240 yuyv at 15 fps", [[320, 240]])
 
 
+def test_a_camera_that_broke_off_is_gone_at_once(camera: EmulatedCamera, watch: Watch) -> None:
+    assert watch("broken_off", camera)["kept"] == 0
+
+
 def test_busy_device_names_its_holder(camera: EmulatedCamera, watch: Watch) -> None:
     result = watch("busy", camera)
     assert f"in use by process {result['pid']} (" in result["error"]

@@ -5,6 +5,7 @@ Prints one JSON object: what the scenario saw, with the warnings that were logge
 
 from __future__ import annotations
 
+import gc
 import json
 import logging
 import os
@@ -186,6 +187,21 @@ def fatal(uri: str, camera: EmulatedCamera) -> dict[str, Any]:
         results["back"] = str(capture.granted)
         results["size"] = [frame["size"] for frame in read(capture, 1)]
     return results
+
+
+@scenario
+def broken_off(uri: str, camera: EmulatedCamera) -> dict[str, Any]:
+    """How many captures are still there after ten that broke off, without garbage collection."""
+    gc.collect()
+    gc.disable()
+    for _ in range(10):
+        camera.fault()
+        with V4L2Capture(uri) as capture:
+            read(capture, 1)
+            camera.fault("eio")
+            _end_of(capture)
+    del capture
+    return {"kept": sum(isinstance(item, V4L2Capture) for item in gc.get_objects())}
 
 
 def _end_of(capture: V4L2Capture) -> dict[str, Any]:

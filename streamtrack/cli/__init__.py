@@ -16,7 +16,7 @@ import typer
 from streamtrack.cli.bench import bench_app
 from streamtrack.cli.devices import devices
 from streamtrack.cli.mosaic import mosaic
-from streamtrack.cli.process import hide_secrets, limit_arenas
+from streamtrack.cli.process import hide_secrets
 from streamtrack.cli.tools import synth, view
 from streamtrack.cli.track import track
 from streamtrack.errors import StreamtrackError, UsageError
@@ -72,7 +72,6 @@ def main() -> None:
     os.environ.setdefault("MIMALLOC_PURGE_DELAY", "0")
     # Its matrices are small: threads for them only wait for each other, at full speed.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    limit_arenas()
     hide_secrets(sys.argv)
     # Nothing plugs into pydantic here, and looking for it reads every installed package's metadata.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")

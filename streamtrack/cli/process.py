@@ -1,4 +1,4 @@
-"""What the program does to its own process before it works: its memory, and what `ps` shows."""
+"""What `ps` shows of the program."""
 
 from __future__ import annotations
 
@@ -10,18 +10,7 @@ from pathlib import Path
 
 from streamtrack.sources.addresses import secrets_of
 
-_M_ARENA_MAX = -8
 _ARG_START, _ARG_END = 48, 49
-
-
-def limit_arenas() -> None:
-    """Have glibc keep freed memory in two places, not one a thread; elsewhere nothing happens.
-
-    Frames pass from thread to thread: in runs of weeks each thread's share would fill up with
-    holes (mallopt(3), M_ARENA_MAX).
-    """
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).mallopt(ctypes.c_int(_M_ARENA_MAX), ctypes.c_int(2))
 
 
 def hide_secrets(arguments: Sequence[str]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol, Self, TypeVar
 
 from streamtrack.errors import SourceError
 from streamtrack.types import Image, Packet, SourceInfo
@@ -20,6 +20,19 @@ class CaptureFinishedError(CaptureEndedError):
 
 class CaptureRefusedError(SourceError):
     """The peer knows us and does not want us (credentials): trying soon again would not help."""
+
+
+_Error = TypeVar("_Error", bound=Exception)
+
+
+def without_frames(error: _Error) -> _Error:
+    """The error, to be kept, without the program's frames that it came through.
+
+    These hold the device and its last picture, which would stay, in a cycle with the error, until
+    a full garbage collection; while frames stream there may be none for days.
+    """
+    error.__traceback__ = error.__context__ = error.__cause__ = None
+    return error
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,6 +21,7 @@ from streamtrack.sources.capture import (
     CaptureEndedError,
     CaptureFinishedError,
     CaptureRefusedError,
+    without_frames,
 )
 from streamtrack.sources.live_status import Journal, LiveEvent, LiveState, LiveStatus
 from streamtrack.types import Frame, Packet, Size, Skipped, SourceInfo
@@ -195,7 +196,7 @@ class LiveSource:
                     break
                 except SourceError as error:
                     self._journal.count(failed_openings=1)
-                    reason = error
+                    reason = without_frames(error)
                 self._wait_to_reopen(reason)
         except StreamtrackError as error:
             self._error = error
@@ -218,7 +219,7 @@ class LiveSource:
                 except CaptureFinishedError:
                     raise
                 except CaptureEndedError as error:
-                    return error
+                    return without_frames(error)
                 now_s = time.monotonic()
                 if captured is None:
                     if now_s - last_s >= self._settings.stall_timeout_s:

@@ -247,7 +247,7 @@ class V4L2Capture:
         except OSError as error:
             if newest is None:
                 raise self._end(error) from None
-            self._ended = error
+            self._ended = _plain(error)
             return newest, False
         return newest, count >= self._stream.buffers
 
@@ -290,12 +290,17 @@ class V4L2Capture:
         return Layout(granted.fourcc, granted.size_wh, granted.stride, granted.is_full_range)
 
     def _end(self, error: OSError) -> CaptureEndedError:
-        self._ended = error
+        self._ended = _plain(error)
         if error.errno in (errno.ENODEV, errno.ENXIO):
             return CaptureEndedError(f"{self._path} was unplugged: plug it in again")
         return CaptureEndedError(
             f"{self._path} broke off ({error.strerror or error}): open it again"
         )
+
+
+def _plain(error: OSError) -> OSError:
+    """An error to keep: the one that was raised holds, by its frames, the capture that keeps it."""
+    return OSError(error.errno, error.strerror)
 
 
 def _set_format(fd: int, path: str, mode: Mode, is_mplane: bool) -> Granted:

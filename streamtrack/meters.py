@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 import resource
 import sys
+import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,3 +79,26 @@ def peak_rss_mb() -> float:
     except (OSError, IndexError, ValueError):
         unit = 1 if sys.platform == "darwin" else 1024
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+
+
+class StageClock:
+    """Wall milliseconds that one frame's stages took; ``total_ms`` runs from when it was made."""
+
+    def __init__(self) -> None:
+        self._began = time.perf_counter()
+        self.stage_ms: dict[str, float] = {}
+
+    @property
+    def total_ms(self) -> float:
+        return (time.perf_counter() - self._began) * 1e3
+
+    def add(self, stage: str, spent_ms: float) -> None:
+        """Count time to a stage, on top of what it took so far."""
+        self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + spent_ms
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Count what happens inside to a stage."""
+        began = time.perf_counter()
+        yield
+        self.add(stage, (time.perf_counter() - began) * 1e3)

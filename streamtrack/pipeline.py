@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Generator, Sequence
 from itertools import islice
 
@@ -17,6 +16,7 @@ from streamtrack.errors import TargetError, UsageError
 from streamtrack.features import FeatureExtractor
 from streamtrack.frame_view import FrameView
 from streamtrack.ground import make_ground
+from streamtrack.meters import StageClock
 from streamtrack.settings import Settings
 from streamtrack.sources.base import FrameSource
 from streamtrack.targets import (
@@ -67,44 +67,39 @@ def track(
     graph = graph_in_full_size(camera.graph, source.info.size_wh, settings.max_width)
     world = WorldMotion(graph, make_ground(settings.world))
     stop = None if frames is None else start + max(0, (frames - 1) * step + 1)
-    is_first = True
-    world_size_wh = (0, 0)
+    world_size_wh = source.info.size_wh
     last: Frame | None = None
     for frame in islice(source, start, stop, step):
-        began = time.perf_counter()
+        clock = StageClock()
         work = budget.level
         view = FrameView(working_size.small(frame), extractors[work.index], work)
-        if is_first:
+        if last is None:
             trackers = [
                 make_tracker(working_size.target(target), view, extractors[0], settings)
                 for target in given
             ]
-            is_first, world_size_wh = False, frame.size_wh
-        if last is not None and _is_elsewhere(last, frame):
+            world_size_wh = frame.size_wh
+        elif _is_elsewhere(last, frame):
             for tracker in trackers:
                 tracker.forget_place()
             auto = _make_auto(targets, auto)
         last = frame
-        tracks, track_ms = _follow_all(trackers, view)
-        camera_began = time.perf_counter()
-        is_same_size = frame.size_wh == world_size_wh
+        tracks = _follow_all(trackers, view, clock)
         moving = tracks if auto is None else (*tracks, *auto.expected())
-        pose = camera.update(view, moving) if is_same_size else _POSE_AT_OTHER_SIZE
-        camera_ended = time.perf_counter()
+        with clock.timed("camera"):
+            is_same_size = frame.size_wh == world_size_wh
+            pose = camera.update(view, moving) if is_same_size else _POSE_AT_OTHER_SIZE
         if auto is not None:
-            tracks = (*tracks, *auto.update(view, pose, tracks))
-        ended = time.perf_counter()
-        stage_ms = {**track_ms, "total": (ended - began) * 1e3}
-        if auto is not None:
-            stage_ms[AUTO_STAGE] = (ended - camera_ended) * 1e3
+            with clock.timed(AUTO_STAGE):
+                tracks = (*tracks, *auto.update(view, pose, tracks))
         if view.detected is not None:
-            stage_ms["detect"] = view.detect_ms
-        if settings.camera != "fixed":
-            stage_ms["camera"] = (camera_ended - camera_began) * 1e3
-        budget.note(stage_ms["total"] + frame.waited_s * 1e3)
-        step_seen = Step(view.frame, tracks, pose, view.detected, stage_ms, work.index)
-        yield world.placed(working_size.full(frame, step_seen))
-    if is_first and start > 0 and frames != 0:
+            clock.add("detect", view.detect_ms)
+        total_ms = clock.total_ms
+        budget.note(total_ms + frame.waited_s * 1e3)
+        stage_ms = {**clock.stage_ms, "total": total_ms}
+        seen = Step(view.frame, tracks, pose, view.detected, stage_ms, work.index)
+        yield world.placed(working_size.full(frame, seen))
+    if last is None and start > 0 and frames != 0:
         raise UsageError(f"the source has no frame {start}: it ended before")
 
 
@@ -137,19 +132,16 @@ def _extractors(settings: Settings) -> list[FeatureExtractor]:
 
 
 def _follow_all(
-    trackers: Sequence[TargetTracker], view: FrameView
-) -> tuple[tuple[Track, ...], dict[str, float]]:
-    """Every target in the frame, and the milliseconds it took by the way it was found."""
+    trackers: Sequence[TargetTracker], view: FrameView, clock: StageClock
+) -> tuple[Track, ...]:
+    """Every target in the frame; its time counts to the way it was found, detection apart."""
     tracks: list[Track] = []
-    track_ms: dict[str, float] = {}
     for tracker in trackers:
-        began = time.perf_counter()
-        detect_before = view.detect_ms
+        began_ms, detect_ms = clock.total_ms, view.detect_ms
         tracks.append(tracker.update(view))
-        spent_ms = (time.perf_counter() - began) * 1e3 - (view.detect_ms - detect_before)
-        stage = "flow" if tracks[-1].means == "flow" else "match"
-        track_ms[stage] = track_ms.get(stage, 0.0) + spent_ms
-    return tuple(tracks), track_ms
+        spent_ms = clock.total_ms - began_ms - (view.detect_ms - detect_ms)
+        clock.add("flow" if tracks[-1].means in ("flow", "view") else "match", spent_ms)
+    return tuple(tracks)
 
 
 def make_tracker(

@@ -62,7 +62,7 @@ def test_every_frame_is_one_step(clip: Clip, method: str, camera: str) -> None:
         assert all(t.state is TrackState.TRACKING for t in step.tracks)
         assert step.camera.world_from_frame is not None
         assert ("detect" in step.stage_ms) == (step.features is not None)
-        assert ("camera" in step.stage_ms) == (camera == "moving")
+        assert step.stage_ms["camera"] >= 0  # a fixed camera is checked, which takes time too
         assert all(ms >= 0 for ms in step.stage_ms.values())
         parts = sum(ms for name, ms in step.stage_ms.items() if name != "total")
         assert step.stage_ms["total"] == max(step.stage_ms.values())

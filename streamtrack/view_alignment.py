@@ -76,10 +76,12 @@ def align(
             # Coarse levels may lead astray where texture is fine or weak.
             tried = (view_from_reference, start)
             view_from_reference = max(tried, key=lambda m: _likeness(reference, view, level, m))
-        fitted = _fit(reference, view, level, view_from_reference, hidden)
-        if fitted is None:
-            return refusal(Verdict.TOO_FEW_FEATURES if level == USUAL else Verdict.OUT_OF_VIEW)
-        view_from_reference = fitted.view_from_reference
+        found = _fit(reference, view, level, view_from_reference, hidden)
+        if found is not None:
+            fitted, view_from_reference = found, found.view_from_reference
+        elif level == USUAL:
+            return refusal(Verdict.TOO_FEW_FEATURES if fitted is not None else Verdict.OUT_OF_VIEW)
+        # Else what is hidden leaves too little of a coarse level: a finer one may hold enough.
     assert fitted is not None
     return _stiffened(reference, view, start, fitted, hidden)
 

@@ -429,3 +429,31 @@ def test_synth_says_what_cannot_be_written(tmp_path: Path) -> None:
         write_synthetic(uri, tmp_path / "file" / "frames")
     with pytest.raises(OutputError):
         write_synthetic(uri, tmp_path / "frames", tmp_path / "file" / "truth.csv")
+
+
+@pytest.mark.parametrize("camera", ["fixed", "moving"])
+def test_traffic_tells_where_everything_is(camera: str) -> None:
+    source = source_of("traffic", f"seed=5&size=320x180&frames=60&cars=10&camera={camera}")
+    first, later = source.things(0), source.things(40)
+    assert len({thing.number for thing in later}) == len(later) >= 2
+    assert first[0].number == 0 and first[0].visible_share == pytest.approx(1.0, abs=1e-6)
+    np.testing.assert_allclose(first[0].quad, source.truth(0).quad, atol=1e-4)
+    is_moving = not np.allclose(source.truth(40).world_from_frame, np.eye(3), atol=1e-6)
+    assert is_moving == (camera == "moving")
+
+
+def test_a_footbridge_hides_what_passes_below() -> None:
+    source = source_of("traffic", "seed=5&size=320x180&frames=120&cars=12&occluders=1")
+    shares = [thing.visible_share for index in range(0, 120, 6) for thing in source.things(index)]
+    assert any(0.02 < share < 0.8 for share in shares)
+
+
+@pytest.mark.parametrize("query", ["cars=0", "cars=x", "camera=drone", "camera=auto"])
+def test_bad_parameters_of_traffic(query: str) -> None:
+    with pytest.raises(UsageError):
+        source_of("traffic", query)
+
+
+def test_cars_belong_to_traffic() -> None:
+    with pytest.raises(UsageError, match="traffic"):
+        source_of("board", "cars=3")

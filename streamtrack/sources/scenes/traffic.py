@@ -92,7 +92,10 @@ class Lane:
 def cars_on(
     seed: int, road: Road, frames: int, size_wh: Size, view: MatrixAt, count: int
 ) -> tuple[Layer, ...]:
-    """The cars and what crosses, the lowest first; all are in view at some time."""
+    """The cars and what crosses, the lowest first; all are in view at some time.
+
+    The first stands in the middle of frame 0.
+    """
     lanes = [Lane(seed, lane) for lane in range(LANES)]
     starts: list[list[tuple[float, int]]] = [[] for _ in range(LANES)]
     crossing: list[int] = []
@@ -101,18 +104,34 @@ def cars_on(
             crossing.append(number)
             continue
         rng = stream(seed, f"place {number}")
-        lane = number % LANES
+        lane = (number + LANES // 2) % LANES
+        if number == 0:
+            starts[lane].append((_looked_at(view, 0.0, size_wh), number))
+            continue
         met = float(rng.uniform(-0.05, 1.0)) * frames
         x = _looked_at(view, met, size_wh) + float(rng.uniform(-0.45, 0.45)) * size_wh[0]
         starts[lane].append((x - road.direction(lane) * lanes[lane].run(met), number))
     layers: list[Layer] = []
-    for lane, places in enumerate(starts):
-        x = -math.inf
-        for wanted, number in sorted(places):
-            x = max(wanted, x + 1.5 * CAR_PER_LANE * road.lane_px)
+    for lane in (*range(LANES // 2, LANES), *range(LANES // 2)):
+        for x, number in _apart(starts[lane], 1.5 * CAR_PER_LANE * road.lane_px):
             layers.append(_car(seed, number, road, (lane, lanes[lane], x), view))
     layers += [_crossing(seed, n, road, frames, size_wh, view) for n in crossing]
     return tuple(layers)
+
+
+def _apart(places: list[tuple[float, int]], gap_px: float) -> list[tuple[float, int]]:
+    """Places along a lane with their numbers, moved away from the first until none are too near."""
+    if not places:
+        return []
+    kept = [places[0]]
+    right = left = places[0][0]
+    for x, number in sorted(place for place in places[1:] if place[0] >= right):
+        right = max(x, right + gap_px)
+        kept.append((right, number))
+    for x, number in sorted((p for p in places[1:] if p[0] < places[0][0]), reverse=True):
+        left = min(x, left - gap_px)
+        kept.append((left, number))
+    return kept
 
 
 def bridges_over(seed: int, road: Road, size_wh: Size, view: MatrixAt, count: int) -> list[Layer]:
@@ -192,6 +211,8 @@ def _crossing(
     x0 = _looked_at(view, met, size_wh) + float(rng.uniform(-0.35, 0.35)) * size_wh[0]
     direction = float(rng.choice([-1.0, 1.0]))
     speed, drift = float(rng.uniform(1.2, 2.4)), float(rng.uniform(-0.5, 0.5))
+    if abs(x0 - drift * met - size_wh[0] / 2.0) < 0.2 * size_wh[0]:
+        x0 += 0.4 * size_wh[0]  # the first car is to be seen in frame 0
     heading = math.atan2(direction * speed, drift)
 
     def ground_from_thing(n: float) -> Matrix:

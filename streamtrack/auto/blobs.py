@@ -20,7 +20,7 @@ _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 _LEAST_PIXELS = 14  # of the grid
 _LEAST_CLEAR = 6
 _ALL_KNOWN_SHARE = 0.98
-_CLOSING_PX = 5
+_CLOSING_PX = 3
 _SHADE_CLOSING_PX = 9
 _MOST_BLOBS = 80
 _FASTEST_PX = 14.0  # grid pixels a frame that flow still measures
@@ -31,6 +31,7 @@ _ALIKE_PX = 0.8  # grid pixels a frame, between motions of parts of one thing
 _SPLIT_PIXELS = 60
 _SPLIT_SHARE = 0.22
 _SPLIT_PX = 1.0  # grid pixels a frame between the motions of two things that touch
+_SPLIT_SPEED_SHARE = 0.3  # of the mean motion
 _TIGHT = 0.45  # spread within the parts against the distance between them
 
 
@@ -192,7 +193,8 @@ def _split(inside: Mask, motion: npt.NDArray[np.float32]) -> list[Mask]:
         cut = 0.5 * (float(low.mean()) + float(high.mean()))
     apart = float(high.mean() - low.mean())
     within = float(np.sqrt((low.var() * len(low) + high.var() * len(high)) / len(along)))
-    if apart < _SPLIT_PX or within > _TIGHT * apart:
+    speed = float(np.hypot(*middle))  # flow errs with it
+    if apart < max(_SPLIT_PX, _SPLIT_SPEED_SHARE * speed) or within > _TIGHT * apart:
         return [inside]
     is_high = np.zeros_like(inside)
     is_high[rows, columns] = along >= cut

@@ -322,12 +322,12 @@ def killed(folder: Path) -> Row:
             mended = again.wait(lambda: again.said("mended", began), "mended file")
             recovered_s = again.wait(lambda: again.of("frame"), "frame")[0]["t"] - began
             again.stop()
-    frames = rrd_columns(folder / "run-000001.rrd", "/metrics/ms", "Scalars:scalars")[0]
+    frames = rrd_columns(Path(record).with_stem("run-000001"), "/metrics/ms", "Scalars:scalars")[0]
     return Row(
         None,
         recovered_s,
         None,
-        f"{last - max(frames)} of {last + 1} in the file",
+        f"{last - max(frames, default=-1)} of {last + 1}",
         None,
         f"mended {mended['t'] - began:.1f} s after the kill, while tracking",
     )

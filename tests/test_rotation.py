@@ -359,6 +359,36 @@ def killed(tmp_path_factory):
     return (folder / "cam-000001.rrd").read_bytes()
 
 
+LARGE_RUN = """
+import os, sys, time
+from pathlib import Path
+import numpy as np
+from dataclasses import replace
+from test_recording import Recorder, source, step_of
+from streamtrack.settings import Settings
+from streamtrack.types import Frame, Packet
+info = replace(source(), packet_codec="mjpeg", is_live=True)
+noise = np.random.default_rng(1).bytes(150_000)
+with Recorder(Path(sys.argv[1]), info, Settings(), ["board"]) as recorder:
+    for index in range(60):
+        step = step_of(index)
+        packets = (Packet(step.frame.time_s, noise, True),)
+        recorder.log(replace(step, frame=replace(step.frame, packets=packets)))
+        time.sleep(1 / 30)
+    time.sleep(1.0)
+    os._exit(9)
+"""
+
+
+def test_small_values_beside_large_pictures_survive_a_kill(tmp_path):
+    tests = Path(__file__).parent
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tests), str(tests.parent)])}
+    path = tmp_path / "run.rrd"
+    subprocess.run([sys.executable, "-c", LARGE_RUN, str(path)], env=environment, check=False)
+    assert "mended" in mend(path)
+    assert rrd_columns(path, "/metrics/ms", "Scalars:scalars")[0] == list(range(60))
+
+
 @pytest.mark.parametrize("cut", [0, 1000])
 def test_the_next_run_mends_what_a_kill_left(tmp_path, killed, caplog, cut):
     left = tmp_path / "cam-000007.rrd"

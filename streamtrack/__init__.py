@@ -15,6 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from streamtrack.auto_camera import make_camera
     from streamtrack.errors import (
         OutputError,
         SourceError,
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
         TargetError,
         UsageError,
     )
+    from streamtrack.mosaic.stream import StreamMosaic
     from streamtrack.pipeline import track
     from streamtrack.settings import Settings, build_settings
     from streamtrack.sources import open_source
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
         TrackState,
         Verdict,
     )
+    from streamtrack.world import WorldPlace
 
 __all__ = [
     "AutoTarget",
@@ -57,6 +60,7 @@ __all__ = [
     "SourceError",
     "SourceInfo",
     "Step",
+    "StreamMosaic",
     "StreamtrackError",
     "Target",
     "TargetError",
@@ -64,13 +68,16 @@ __all__ = [
     "TrackState",
     "UsageError",
     "Verdict",
+    "WorldPlace",
     "build_settings",
+    "make_camera",
     "open_source",
     "parse_targets",
     "track",
 ]
 
 _HOMES = {
+    "streamtrack.auto_camera": ("make_camera",),
     "streamtrack.errors": (
         "OutputError",
         "SourceError",
@@ -78,11 +85,13 @@ _HOMES = {
         "TargetError",
         "UsageError",
     ),
+    "streamtrack.mosaic.stream": ("StreamMosaic",),
     "streamtrack.pipeline": ("track",),
     "streamtrack.settings": ("Settings", "build_settings"),
     "streamtrack.sources": ("open_source",),
     "streamtrack.sources.base": ("FrameSource",),
     "streamtrack.targets": ("AutoTarget", "Target", "parse_targets"),
+    "streamtrack.world": ("WorldPlace",),
 }
 
 

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -165,6 +166,31 @@ def test_poses(run: Run, clip: Path, target: str, tmp_path: Path, camera: str) -
     assert abs(float(rows[3]["h13"])) < 1.0  # the board moves, the desk behind it does not
 
 
+LINE = [part for n in range(4) for part in ("--ground", f"{n},{n}={n},{n}")]
+
+
+def test_the_world_is_asked_for_and_told(run: Run, clip: Path, target: str, tmp_path: Path) -> None:
+    """Units in the table, the video held still, and the camera found out, which is said."""
+    flags = ("--no-record", "-q", "--scale", 10, "--stabilize", "s.mp4", "--output", "t.csv")
+    assert run("track", clip, "--target", f"b={target}", *flags, "--summary", "s.json") == 0
+    rows = rows_of(tmp_path / "t.csv")
+    assert float(rows[-1]["ground_x"]) > 0 and rows[-1]["speed_units_s"]
+    assert float(rows[0]["world_x1"]) == float(rows[0]["x1"])
+    summary = json.loads((tmp_path / "s.json").read_text())
+    assert summary["camera"] == "auto" and summary["camera_notes"] == ["moves from frame 0"]
+    held_still = cv2.VideoCapture(str(tmp_path / "s.mp4"))
+    assert held_still.get(cv2.CAP_PROP_FRAME_COUNT) == len(rows)
+
+
+@pytest.mark.parametrize(("flags", "camera"), [((), "fixed"), (("--poses", "p.csv"), "auto")])
+def test_the_camera_is_taken_for_fixed_unless_the_world_is_wanted(
+    run: Run, clip: Path, target: str, tmp_path: Path, flags: tuple[str, ...], camera: str
+) -> None:
+    options = ("--no-record", "-q", "--frames", 3, "--summary", "s.json", *flags)
+    assert run("track", clip, "--target", target, *options) == 0
+    assert json.loads((tmp_path / "s.json").read_text())["camera"] == camera
+
+
 def bad_files(folder: Path) -> None:
     (folder / "empty.mp4").touch()
     (folder / "text.mp4").write_text("no video")
@@ -199,6 +225,19 @@ def bad_files(folder: Path) -> None:
         (["{clip}", "--output", "folder/"], 2, ".parquet"),
         (["{clip}", "--video", "t.gif"], 2, ".webm"),
         (["{clip}", "--record", "r.rrd"], 2, "contradict"),
+        (["{clip}", "--camera", "mooving"], 2, "did you mean moving"),
+        (["{clip}", "--scale", "0"], 2, "greater than 0"),
+        (["{clip}", "--scale", "nan"], 2, "world.px_per_unit"),
+        (["{clip}", "--scale", "5", "--ground", "0,0=0,0"], 2, "give one of them"),
+        (["{clip}", "--ground", "0,0=0,0"], 2, "four known points or more, and 1"),
+        (["{clip}", "--ground", "0;0=0;0"], 2, "write x,y=X,Y"),
+        (["{clip}", *LINE], 2, "no three are in a line"),
+        (["{clip}", "--stabilize", "s.gif"], 2, ".webm"),
+        (["{clip}", "--stabilize", "{clip}"], 2, "would replace the source"),
+        (["{clip}", "--stabilize", "s.mp4", "--video", "s.mp4"], 2, "would replace the video"),
+        (["{clip}", "--stabilize-path", "world"], 2, "give --stabilize"),
+        (["{clip}", "--stabilize", "s.mp4", "--stabilize-path", "smoth"], 2, "mean smooth"),
+        (["{clip}", "--stabilize", "folder"], 2, "unknown video ending"),
     ],
 )
 def test_bad_input_is_one_clear_line(

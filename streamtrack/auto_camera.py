@@ -1,8 +1,9 @@
 """Does the camera stand or move? Found out by what it does, and asked again in every frame.
 
-It moves until it has stood for a while. While it stands its pose does not change, and a glance at
-a small picture (`standing`) tells whether that is still so; what the glance doubts is estimated as
-for a moving camera, so a frame in which a tripod was bumped already has its true pose.
+It moves until the picture has been the same for a while. While it stands its pose does not change,
+and a glance at a small picture (`standing`) tells whether that is still so; what the glance doubts
+is estimated as for a moving camera, so a frame in which a tripod was bumped already has its true
+pose.
 """
 
 from __future__ import annotations
@@ -23,10 +24,11 @@ from streamtrack.types import CameraKind, CameraPose, Matrix, Points, Size, Trac
 from streamtrack.view_levels import ViewLevels
 
 _STILL_PX = 0.75
-"""Corners of a camera that stands are estimated within this distance of each other."""
+"""Poses that differ by more are not those of a camera that stands."""
 _DOUBT_PX = 0.5
 _STILL_FRAMES = 25
 _MOST_STILL_FRAMES = 400
+_OTHER_FRAMES = 5  # in a row: something large may pass by
 _RENEW_EVERY = 250  # frames, so that the light may change
 
 
@@ -63,7 +65,7 @@ class AutoCamera:
     def __init__(self, settings: Settings, *, is_live: bool = False) -> None:
         self._moving = MovingCamera(settings, is_live=is_live)
         self._standing: _Standing | None = None
-        self._rest = _Rest()
+        self._rest: _Rest | None = None
         self._needed = _STILL_FRAMES
 
     @property
@@ -81,25 +83,31 @@ class AutoCamera:
         if self._standing is not None:
             return self._glance(self._standing, view, tracks)
         pose = self._moving.update(view, tracks)
-        if pose.world_from_frame is not None:
-            self._rest.add(pose.world_from_frame, view.size_wh)
-            if self._rest.frames >= self._needed and pose.keyframe is not None:
-                self._stand(pose.keyframe, view, tracks)
+        if pose.world_from_frame is not None and pose.keyframe is not None:
+            self._look_for_rest(pose.world_from_frame, pose.keyframe, view, tracks)
         return replace(pose, kind=CameraKind.MOVING)
 
     def close(self) -> None:
         """Finish the work on loops."""
         self._moving.close()
 
-    def _stand(self, keyframe: int, view: FrameView, tracks: Sequence[Track]) -> None:
-        """From here on the camera stands, if that can be watched."""
-        check = StandCheck(ViewLevels(view.grey), _hidden(tracks))
-        if check.is_possible:
-            world_from_keyframe = self.graph.keyframes[keyframe].world_from_keyframe
-            pose = self._rest.pose(view.size_wh)
-            keyframe_from_frame = geometry.inverted(world_from_keyframe) @ pose
-            self._standing = _Standing(keyframe, geometry.normalized(keyframe_from_frame), check)
-        self._rest = _Rest()
+    def _look_for_rest(
+        self, pose: Matrix, keyframe: int, view: FrameView, tracks: Sequence[Track]
+    ) -> None:
+        """Has the picture been the same for long enough? From here on the camera stands then."""
+        levels, hidden, rest = ViewLevels(view.grey), _hidden(tracks), self._rest
+        if rest is not None and rest.check.of(levels, hidden).moved_px < _DOUBT_PX:
+            rest.add(pose, view.size_wh)
+            if rest.frames >= self._needed:
+                found = rest.pose(view.size_wh)
+                world_from_keyframe = self.graph.keyframes[keyframe].world_from_keyframe
+                in_keyframe = geometry.normalized(geometry.inverted(world_from_keyframe) @ found)
+                self._standing = _Standing(keyframe, in_keyframe, rest.check)
+                self._rest = None
+        elif rest is None or rest.is_over():
+            check = StandCheck(levels, hidden)
+            is_start = view.frame.index == next(iter(self.graph.keyframes))
+            self._rest = _Rest(check, is_start) if check.is_possible else None
 
     def _glance(self, standing: _Standing, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
         """The pose of a camera that stood until now."""
@@ -134,23 +142,28 @@ class AutoCamera:
 
 
 class _Rest:
-    """How long the estimated poses have been the same, and which one that is."""
+    """How long the picture has been as in one frame, and the pose that was estimated meanwhile."""
 
-    def __init__(self) -> None:
+    def __init__(self, check: StandCheck, is_start: bool) -> None:
+        self.check = check
         self.frames = 0
-        self._first: Matrix = np.eye(3)
+        self._others = 0
+        self._is_start = is_start
         self._corners = np.zeros((4, 2))
+
+    def is_over(self) -> bool:
+        """Whether the picture, now another, has been for long enough to compare with a new one."""
+        self._others += 1
+        return self._others >= _OTHER_FRAMES
 
     def add(self, world_from_frame: Matrix, size_wh: Size) -> None:
         corners = geometry.transform_points(world_from_frame, geometry.image_quad(size_wh))
-        if not self.frames or _apart_px(world_from_frame, self._first, size_wh) > _STILL_PX:
-            self.frames, self._first, self._corners = 0, world_from_frame, np.zeros((4, 2))
-        self.frames += 1
+        self.frames, self._others = self.frames + 1, 0
         self._corners += corners
 
     def pose(self, size_wh: Size) -> Matrix:
-        """The mean pose; exactly the world's own if it is that."""
-        if _apart_px(self._first, np.eye(3), size_wh) <= _STILL_PX:
+        """The mean pose; the world's own if the picture is that of its first frame."""
+        if self._is_start:
             return np.eye(3)
         mean = np.asarray(self._corners / self.frames, np.float32)
         return geometry.quad_mapping(geometry.image_quad(size_wh), mean)
@@ -161,7 +174,11 @@ def _hidden(tracks: Sequence[Track]) -> list[Points]:
 
 
 def _apart_px(one: Matrix, other: Matrix, size_wh: Size) -> float:
-    """How far apart two poses put the corner that differs most."""
-    quad = geometry.image_quad(size_wh)
+    """How far apart two poses put a point of the picture's inner half, at most.
+
+    There, as its corners depend on what little texture is next to them.
+    """
+    width, height = size_wh
+    quad = geometry.box_quad(width / 4, height / 4, width / 2, height / 2)
     off = geometry.transform_points(one, quad) - geometry.transform_points(other, quad)
     return float(np.max(np.hypot(off[:, 0], off[:, 1])))

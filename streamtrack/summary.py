@@ -393,7 +393,7 @@ class SummaryBuilder:
 
     def _add_track(self, track: Track, frame: int) -> None:
         self._targets.setdefault(track.name, _TargetSums(track.name)).add(track, frame)
-        if track.state is TrackState.TRACKING:
+        if track.state is TrackState.TRACKING and not track.is_found:
             self._match_counts[len(track.evidence)] += 1
             self._inliers.add(track.evidence.inliers)
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.types import Mask, Matrix, Size
+from streamtrack.types import Mask, Matrix, Points, Size
 
 _BLOCK = 64
 Values: TypeAlias = npt.NDArray[np.int32]
@@ -28,8 +30,13 @@ class Footprint:
         return int(np.count_nonzero(self.seen))
 
 
-def footprint(world_from_frame: Matrix, size_wh: Size, cell_px: float) -> Footprint:
-    """The cells whose centres lie inside a frame. ``cell_px`` is their side in world pixels."""
+def footprint(
+    world_from_frame: Matrix, size_wh: Size, cell_px: float, hidden: Sequence[Points] = ()
+) -> Footprint:
+    """The cells whose centres lie inside a frame. ``cell_px`` is their side in world pixels.
+
+    Those that lie in the quads ``hidden`` (4, 2) of the frame are not seen.
+    """
     quad = geometry.transform_points(world_from_frame, geometry.image_quad(size_wh))
     x0, y0, x1, y1 = (int(np.floor(v / cell_px)) for v in geometry.bounding_box(quad))
     columns, rows = np.arange(x0, x1 + 1), np.arange(y0, y1 + 1)
@@ -38,6 +45,12 @@ def footprint(world_from_frame: Matrix, size_wh: Size, cell_px: float) -> Footpr
     seen = np.ones(x.shape, np.bool_)
     for (ax, ay), (bx, by) in zip(a, b, strict=True):  # clockwise: inside is to the right
         seen &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= 0
+    for outline in hidden:
+        there = geometry.transform_points(world_from_frame, outline) / cell_px
+        corners = np.rint(np.clip(there - (x0 + 0.5, y0 + 0.5), -1e4, 1e4)).astype(np.int32)
+        inside = np.zeros(seen.shape, np.uint8)
+        cv2.fillConvexPoly(inside, corners, 1)
+        seen &= inside == 0
     return Footprint(x0, y0, seen)
 
 

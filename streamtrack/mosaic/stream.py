@@ -190,7 +190,7 @@ class StreamMosaic:
         corners = geometry.image_quad(frame.size_wh)
         self._outline = geometry.transform_points(world_from_frame, corners)
         self._near = geometry.transform_points(canvas_from_frame, corners).mean(axis=0)
-        need = store.need(world_from_frame, frame.size_wh, self._moment)
+        need = store.need(world_from_frame, frame.size_wh, self._moment, quads)
         waiting = self._waiting
         if need.new >= NEW_SHARE or need.wants_sample or not len(store):
             self._waiting = None

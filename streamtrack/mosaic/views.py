@@ -86,9 +86,11 @@ class ViewStore:
     def __len__(self) -> int:
         return len(self.views)
 
-    def need(self, world_from_frame: Matrix, size_wh: Size, moment: int) -> Need:
+    def need(
+        self, world_from_frame: Matrix, size_wh: Size, moment: int, quads: Sequence[Points] = ()
+    ) -> Need:
         """What a frame at this place and moment would add."""
-        cells = footprint(world_from_frame, size_wh, self._cell_px)
+        cells = footprint(world_from_frame, size_wh, self._cell_px, quads)
         seen = cells.seen
         total = max(1, cells.count)
         counts = self._counts.read(cells)[seen]
@@ -104,7 +106,7 @@ class ViewStore:
         self, frame: Frame, world_from_frame: Matrix, quads: tuple[Points, ...], moment: int
     ) -> View:
         """Keep a frame. Raises OutputError if its picture finds room nowhere."""
-        cells = footprint(world_from_frame, frame.size_wh, self._cell_px)
+        cells = footprint(world_from_frame, frame.size_wh, self._cell_px, quads)
         small = gains.THUMB_SIDE / max(*frame.size_wh, gains.THUMB_SIDE)
         view = View(
             number=self._next,
@@ -152,7 +154,7 @@ class ViewStore:
         """Give a view another pose."""
         self._leave(view)
         view.world_from_frame = world_from_frame
-        view.cells = footprint(world_from_frame, view.size_wh, self._cell_px)
+        view.cells = footprint(world_from_frame, view.size_wh, self._cell_px, view.quads)
         self._enter(view)
 
     def thin(self, around: View) -> list[View]:

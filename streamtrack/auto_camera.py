@@ -19,7 +19,7 @@ from streamtrack.fixed_camera import FixedCamera
 from streamtrack.frame_view import FrameView
 from streamtrack.keyframes import KeyframeGraph
 from streamtrack.settings import Settings
-from streamtrack.standing import StandCheck
+from streamtrack.standing import Stand, StandCheck
 from streamtrack.types import CameraKind, CameraPose, Matrix, Points, Size, Track, Verdict
 from streamtrack.view_levels import ViewLevels
 
@@ -96,7 +96,7 @@ class AutoCamera:
     ) -> None:
         """Has the picture been the same for long enough? From here on the camera stands then."""
         levels, hidden, rest = ViewLevels(view.grey), _hidden(tracks), self._rest
-        if rest is not None and rest.check.of(levels, hidden).moved_px < _DOUBT_PX:
+        if rest is not None and _is_at_rest(rest.check.of(levels, hidden), rest.check, levels):
             rest.add(pose, view.size_wh)
             if rest.frames >= self._needed:
                 found = rest.pose(view.size_wh)
@@ -117,7 +117,8 @@ class AutoCamera:
             return CameraPose(None, reason=reason, kind=CameraKind.FIXED)
         standing.frames += 1
         seen = standing.check.of(levels, hidden)
-        if seen.moved_px < _DOUBT_PX and standing.frames < _RENEW_EVERY:
+        is_at_rest = _is_at_rest(seen, standing.check, levels)
+        if is_at_rest and standing.frames < _RENEW_EVERY:
             stood = CameraPose(None, seen.pixels, seen.pixels, keyframe=standing.keyframe)
             return self._unmoved(stood, standing, view)
         found = self._moving.update(view, tracks)
@@ -125,6 +126,8 @@ class AutoCamera:
             return replace(found, kind=CameraKind.FIXED)
         pose = standing.pose(self.graph)
         if _apart_px(found.world_from_frame, pose, view.size_wh) > _STILL_PX:
+            if is_at_rest:  # what moves by itself has carried the estimate along
+                return self._unmoved(found, standing, view)
             self._standing = None
             self._needed = min(2 * self._needed, _MOST_STILL_FRAMES)
             return replace(found, kind=CameraKind.MOVING)
@@ -167,6 +170,10 @@ class _Rest:
             return np.eye(3)
         mean = np.asarray(self._corners / self.frames, np.float32)
         return geometry.quad_mapping(geometry.image_quad(size_wh), mean)
+
+
+def _is_at_rest(seen: Stand, check: StandCheck, levels: ViewLevels) -> bool:
+    return seen.moved_px < _DOUBT_PX or check.has_stayed(levels)
 
 
 def _hidden(tracks: Sequence[Track]) -> list[Points]:

@@ -15,13 +15,17 @@ import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.types import Points
-from streamtrack.view_levels import ReferenceView, ViewLevels
+from streamtrack.view_levels import USUAL, Pixels, ReferenceView, ViewLevels
 
 _LEVEL = 2
 _MIN_PIXELS = 120
 _MIN_TEXTURED_CELLS = 12
 _OF_PIXELS = 2  # every second of those that a full alignment would take
 _ROUNDS = 2
+_STAYED_PX = 0.4
+_STAYED_CORRELATION = 0.8
+_STAYED_SHARE = 0.12
+"""Of the textured cells: no camera moves while so many stay to the tenth of a pixel."""
 _UNLIKE = 0.75
 """Residuals of this share of the grey values themselves: the views have little in common."""
 
@@ -82,6 +86,21 @@ class StandCheck:
         change = _robust_step(jacobian, residual)
         return Stand(self._corner_shift_px(change), len(seen))
 
+    def has_stayed(self, levels: ViewLevels) -> bool:
+        """Whether so many parts of the picture are just where they were that the camera stands.
+
+        A second look, for views in which so much moves by itself (a road full of cars) that `of`
+        follows that: each cell of the picture is asked by itself how far its pixels have moved.
+        """
+        pixels = self.reference.pixels(USUAL)
+        column, row, _ = pixels.points.astype(np.intp)
+        seen = levels.high_passed(USUAL)[row, column]
+        shift_px = _cell_shifts(pixels, seen - pixels.values)
+        shift_px /= levels.level_from_view(USUAL)[0, 0]
+        alike = _cell_correlations(pixels, seen) > _STAYED_CORRELATION
+        stayed = np.count_nonzero(alike & (shift_px < _STAYED_PX))
+        return bool(stayed >= _STAYED_SHARE * self.reference.textured_cells)
+
     def _shown(self, levels: ViewLevels, hidden: Sequence[Points]) -> npt.NDArray[np.bool_]:
         """Which pixels lie outside the boxes around the quads."""
         shown = np.ones(len(self._x), np.bool_)
@@ -101,6 +120,35 @@ class StandCheck:
         x, y = self._corners.astype(np.float64).T
         moved = np.hypot(shift_x + zoom * x - turn * y, shift_y + zoom * y + turn * x)
         return float(moved.max()) * self._view_px
+
+
+def _cell_shifts(pixels: Pixels, residual: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+    """How far each cell's pixels seem to have moved (cells,), in level pixels.
+
+    Least squares on the residuals (N,) of its pixels (Lucas & Kanade 1981); NaN without pixels.
+    """
+    unit = pixels.unit_from_level[0, 0]
+    gx, gy = pixels.jacobian[:, 2] * unit, pixels.jacobian[:, 5] * unit
+    xx, xy, yy, xr, yr = (
+        np.bincount(pixels.cell, product)
+        for product in (gx * gx, gx * gy, gy * gy, gx * residual, gy * residual)
+    )
+    damping = 1e-3 * (xx + yy)
+    xx, yy = xx + damping, yy + damping
+    with np.errstate(invalid="ignore"):
+        determinant = xx * yy - xy * xy
+        x, y = (yy * xr - xy * yr) / determinant, (xx * yr - xy * xr) / determinant
+    return np.asarray(np.hypot(x, y), np.float64)
+
+
+def _cell_correlations(pixels: Pixels, seen: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+    """Correlation (cells,) of each cell's pixels with those seen (N,); NaN without pixels."""
+    both, ours, theirs = (
+        np.bincount(pixels.cell, product)
+        for product in (pixels.values * seen, pixels.values**2, seen**2)
+    )
+    with np.errstate(invalid="ignore"):
+        return np.asarray(both / np.sqrt(ours * theirs), np.float64)
 
 
 def _robust_step(

@@ -341,6 +341,19 @@ def test_auto_finds_out_that_a_camera_stands(make_picture: MakePicture) -> None:
     assert max(corner_error(pose.world_from_frame, np.eye(3), SIZE) for pose in found) < 0.2
 
 
+def test_auto_is_not_carried_along_by_traffic(make_picture: MakePicture) -> None:
+    """Two thirds of the view flow by; what stands between them tells that the camera does."""
+    ground, traffic = make_picture(31, SIZE), make_picture(32, (1000, 240))
+    frames = []
+    for n in range(60):
+        image = ground.copy()
+        image[:, 50:270] = traffic[:, 12 * n : 12 * n + 220]
+        frames.append(Frame(n, n / 30, image))
+    camera, found = run_auto(frames)
+    assert camera.is_fixed
+    assert corner_error(found[-1].world_from_frame, np.eye(3), SIZE) < 0.2
+
+
 def test_auto_finds_out_that_a_camera_moves(make_clip: MakeClip) -> None:
     clip = make_clip(FLIGHT, 16)
     camera, found = run_auto(clip.source())

@@ -29,7 +29,7 @@ import numpy.typing as npt
 from streamtrack.auto import AutoTargets
 from streamtrack.auto.assignment import assign
 from streamtrack.auto.followed import overlaps
-from streamtrack.auto_camera import make_camera
+from streamtrack.camera.auto import make_camera
 from streamtrack.features import FeatureExtractor
 from streamtrack.frame_view import FrameView
 from streamtrack.geometry import bounding_box

@@ -33,7 +33,7 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.auto_camera import make_camera
+from streamtrack.camera.auto import make_camera
 from streamtrack.evaluation import corner_error
 from streamtrack.mosaic.stream import StreamMosaic
 from streamtrack.pipeline import track

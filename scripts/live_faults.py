@@ -34,7 +34,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 from rrd import rrd_columns
 
-from streamtrack.repair import is_whole
+from streamtrack.recording.repair import is_whole
 from streamtrack.viewer import viewer_executable
 from tests import rtsp_server, servers
 

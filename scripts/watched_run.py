@@ -20,9 +20,9 @@ from typing import Any
 
 from streamtrack.cli.common import StopOnSignal
 from streamtrack.job import TrackJob, run_track
-from streamtrack.live_server import parse_live
-from streamtrack.live_view import LiveView
 from streamtrack.progress import NoProgress
+from streamtrack.recording.live_server import parse_live
+from streamtrack.recording.live_view import LiveView
 from streamtrack.settings import build_settings
 from streamtrack.sources.live_status import Journal
 from streamtrack.targets import parse_targets

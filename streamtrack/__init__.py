@@ -15,7 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from streamtrack.auto_camera import make_camera
+    from streamtrack.camera.auto import make_camera
     from streamtrack.errors import (
         OutputError,
         SourceError,
@@ -77,7 +77,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "streamtrack.auto_camera": ("make_camera",),
+    "streamtrack.camera.auto": ("make_camera",),
     "streamtrack.errors": (
         "OutputError",
         "SourceError",

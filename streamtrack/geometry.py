@@ -30,7 +30,8 @@ def transform_points(b_from_a: Matrix, points: npt.ArrayLike) -> Points:
                 ((a * x + b * y + c) / depth, (d * x + e * y + f) / depth)
                 for (x, y), depth in zip(corners, depths, strict=True)
             ]
-            return np.array(mapped, np.float32).reshape(-1, 2)
+            with np.errstate(over="ignore"):
+                return np.array(mapped, np.float32).reshape(-1, 2)
     x, y = np.ascontiguousarray(pts.T, np.float64)
     result: Points = np.empty((len(pts), 2), np.float32)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

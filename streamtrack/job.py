@@ -13,8 +13,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Protocol
 
-from streamtrack.auto_camera import make_camera
-from streamtrack.camera import CameraEstimator
+from streamtrack.camera.auto import make_camera
+from streamtrack.camera.moving import CameraEstimator
 from streamtrack.errors import SourceError, StreamtrackError, UsageError
 from streamtrack.mosaic.picture_files import check_picture_path
 from streamtrack.pipeline import track

@@ -9,9 +9,9 @@ import numpy as np
 
 from streamtrack import geometry
 from streamtrack.auto import AutoTargets
-from streamtrack.auto_camera import make_camera
 from streamtrack.budget import LEVELS, Budget
-from streamtrack.camera import CameraEstimator
+from streamtrack.camera.auto import make_camera
+from streamtrack.camera.moving import CameraEstimator
 from streamtrack.errors import TargetError, UsageError
 from streamtrack.features import FeatureExtractor
 from streamtrack.frame_view import FrameView
@@ -26,8 +26,8 @@ from streamtrack.targets import (
     check_quad_in_picture,
     given_targets,
 )
-from streamtrack.template import make_template
-from streamtrack.tracker import DetectTracker, HybridTracker, TargetTracker
+from streamtrack.tracking.template import make_template
+from streamtrack.tracking.tracker import DetectTracker, HybridTracker, TargetTracker
 from streamtrack.types import AUTO_STAGE, CameraPose, Frame, Step, Track
 from streamtrack.working_size import WorkingSize, graph_in_full_size
 from streamtrack.world import WorldMotion

@@ -13,7 +13,7 @@ from typing import Any, Literal, Self, TypeAlias, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from streamtrack.errors import UsageError, unknown_name
-from streamtrack.rotation import check_keep, parse_keep, parse_rotate
+from streamtrack.recording.series import check_keep, parse_keep, parse_rotate
 
 Detector: TypeAlias = Literal["harris", "fast", "agast", "gftt", "brisk", "orb", "sift", "akaze"]
 Descriptor: TypeAlias = Literal["freak", "brisk", "orb", "teblid", "sift", "akaze"]

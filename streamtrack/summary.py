@@ -18,7 +18,6 @@ inliers, transformation model. Definitions:
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections import Counter
@@ -28,11 +27,11 @@ from pathlib import Path
 from typing import Any
 
 from streamtrack.budget import LEVELS
-from streamtrack.camera_notes import CameraNotes
+from streamtrack.camera.notes import CameraNotes
 from streamtrack.meters import LogHistogram, Mean, nearest_rank, peak_rss_mb
-from streamtrack.outputs import write_file
 from streamtrack.settings import Settings
 from streamtrack.sources.live_status import LiveStatus
+from streamtrack.summary_text import cell, markdown, number, write_json
 from streamtrack.types import AUTO_STAGE, Size, Skipped, SourceInfo, Step, Track, TrackState
 
 _LIVE_COUNTS = ("captured", "dropped", "thinned", "lost", "damaged", "reconnects", "stalls")
@@ -72,7 +71,7 @@ class TargetSummary:
         return (
             f"tracked {self.frames_tracked} of {frames} ({self.share:.1%}), "
             f"lost {self.frames_lost}, searching {self.frames_searching}, "
-            f"losses {self.losses}, {seen}, RMSE {_number(self.rmse_px, 2, ' px')}"
+            f"losses {self.losses}, {seen}, RMSE {number(self.rmse_px, 2, ' px')}"
         )
 
 
@@ -216,20 +215,20 @@ class Summary:
         """(label, value) pairs for a table. Names are verbatim: escape them for markup."""
         features = self.settings.features
         used = ", ".join(f"{model} {count}" for model, count in self.models.items())
-        matches = f"mean {_number(self.matches, 1)}, median {_number(self.matches_median, 0)}"
+        matches = f"mean {number(self.matches, 1)}, median {number(self.matches_median, 0)}"
         camera = f"{self.settings.camera}, known in {self.frames_with_pose} frames"
         if self.settings.camera == "fixed":
             camera = "fixed" if self.camera_notes else "fixed (checked)"
         camera = "; ".join((camera, *self.camera_notes))
-        ms = f"median {_number(self.ms_median, 1)} ms, p95 {_number(self.ms_p95, 1)} ms"
+        ms = f"median {number(self.ms_median, 1)} ms, p95 {number(self.ms_p95, 1)} ms"
         return [
             ("Source", f"{self.source}, {self.size_wh[0]}x{self.size_wh[1]}"),
             ("Detector", features.detector),
             ("Threshold", f"{features.threshold_or_default:g}"),
             ("Descriptor", features.descriptor),
-            ("Features", _number(self.features, 0, " a frame")),
+            ("Features", number(self.features, 0, " a frame", "none detected")),
             ("Matches", matches),
-            ("Inliers", _number(self.inliers, 1)),
+            ("Inliers", number(self.inliers, 1)),
             ("Transformation model", used or self.settings.registration.model),
             ("Camera", camera),
             ("Frames", str(self.frames)),
@@ -237,7 +236,7 @@ class Summary:
             *self._auto_rows(),
             ("Tracking time a frame", ms),
             *self._budget_rows(),
-            ("Frames a second", f"{_number(self.fps, 1)}, reading and writing included"),
+            ("Frames a second", f"{number(self.fps, 1)}, reading and writing included"),
             ("Peak memory", f"{self.peak_rss_mb:.0f} MB"),
             ("Corrupt packets", str(self.corrupt_packets)),
             *self._live_rows(),
@@ -257,7 +256,7 @@ class Summary:
         if live is None:
             return []
         counts = ", ".join(f"{name} {getattr(live, name)}" for name in _LIVE_COUNTS)
-        p50, p95 = _number(live.age_ms_p50, 0), _number(live.age_ms_p95, 0)
+        p50, p95 = number(live.age_ms_p50, 0), number(live.age_ms_p95, 0)
         return [
             ("Live pictures", f"{counts}, away {live.away_s:.1f} s"),
             ("Age of a frame when done", f"median {p50} ms, p95 {p95} ms"),
@@ -302,20 +301,18 @@ class Summary:
 
     def to_markdown(self) -> str:
         """The table, and a list of the pictures that were left out."""
-        lines = ["# Tracking summary", "", "| what | value |", "|---|---|"]
-        lines += [f"| {_cell(label)} | {_cell(value)} |" for label, value in self.rows()]
+        lines = markdown("Tracking summary", self.rows())
         if self.skipped:
             lines += ["", "## Skipped pictures", "", "| frame | name | reason |", "|---|---|---|"]
             lines += [
-                f"| {item.index} | {_cell(item.name)} | {_cell(item.reason)} |"
+                f"| {item.index} | {cell(item.name)} | {cell(item.reason)} |"
                 for item in self.skipped
             ]
         return "\n".join(lines) + "\n"
 
     def write_json(self, path: Path) -> None:
         """Write `to_json` as a whole file or not at all. Raises OutputError."""
-        text = json.dumps(self.to_json(), indent=2, ensure_ascii=False, allow_nan=False)
-        write_file(path, (text + "\n").encode("utf-8", "replace"))
+        write_json(path, self.to_json())
 
 
 def _target_json(target: TargetSummary) -> dict[str, Any]:
@@ -334,14 +331,6 @@ def _target_json(target: TargetSummary) -> dict[str, Any]:
         "inliers": target.inliers,
         "models": target.models,
     }
-
-
-def _number(value: float | None, decimals: int, unit: str = "") -> str:
-    return "-" if value is None else f"{value:.{decimals}f}{unit}"
-
-
-def _cell(text: str) -> str:
-    return " ".join(text.split()).replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;")
 
 
 class SummaryBuilder:

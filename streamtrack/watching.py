@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from streamtrack.camera import CameraEstimator
-from streamtrack.camera_notes import CameraNotes
+from streamtrack.camera.moving import CameraEstimator
+from streamtrack.camera.notes import CameraNotes
 from streamtrack.errors import OutputError, StreamtrackError
 from streamtrack.results import GROUND_COLUMNS, TRACK_COLUMNS, PosesWriter, open_tracks_writer
 from streamtrack.settings import Settings, WorldSettings
@@ -26,10 +26,10 @@ from streamtrack.types import Image, SourceInfo, Step
 from streamtrack.working_size import graph_in_full_size
 
 if TYPE_CHECKING:
-    from streamtrack.live_server import LiveAddress
-    from streamtrack.live_view import LiveView
     from streamtrack.mosaic.stream import PoseGraph, StreamMosaic
-    from streamtrack.recording import Recorder
+    from streamtrack.recording.live_server import LiveAddress
+    from streamtrack.recording.live_view import LiveView
+    from streamtrack.recording.recorder import Recorder
     from streamtrack.sources.live import LiveSource
 
 Watcher: TypeAlias = Callable[[Step], None]
@@ -178,19 +178,19 @@ def _open_displays(
     pictures = {name: picture for name, picture in views.items() if picture is not None}
     about = (info, settings, list(views), pictures, outputs.mosaic is not None)
     if outputs.record is not None:
-        from streamtrack.recording import Recorder
+        from streamtrack.recording.recorder import Recorder
 
         result.recorder = stack.enter_context(Recorder(outputs.record, *about))
         displays.append(result.recorder)
     if outputs.live is not None:
-        from streamtrack.live_view import LiveView
+        from streamtrack.recording.live_view import LiveView
 
         displays.append(stack.enter_context(LiveView(outputs.live, *about)))
     return displays
 
 
 def _closer(display: Recorder | LiveView) -> Finisher:
-    from streamtrack.live_view import LiveView
+    from streamtrack.recording.live_view import LiveView
 
     close = display.begin_close if isinstance(display, LiveView) else display.close
     return lambda summary: close(summary.to_markdown())

@@ -10,8 +10,8 @@ import pytest
 from conftest import Clip, FrameList, MakePicture
 
 from streamtrack import geometry
-from streamtrack.auto_camera import AutoCamera, make_camera
-from streamtrack.camera import MovingCamera
+from streamtrack.camera.auto import AutoCamera, make_camera
+from streamtrack.camera.moving import MovingCamera
 from streamtrack.evaluation import corner_error
 from streamtrack.features import FeatureExtractor
 from streamtrack.frame_view import FrameView

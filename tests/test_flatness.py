@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from streamtrack import geometry
-from streamtrack.flatness import Flatness, slant
+from streamtrack.tracking.flatness import Flatness, slant
 from streamtrack.types import Matrix
 
 _QUAD = geometry.box_quad(100, 80, 200, 150)

@@ -9,8 +9,8 @@ import pytest
 from conftest import MakePicture
 
 from streamtrack import geometry
+from streamtrack.camera.keyframes import KeyframeGraph
 from streamtrack.errors import OutputError
-from streamtrack.keyframes import KeyframeGraph
 from streamtrack.mosaic.types import Link
 from streamtrack.types import Image, Matches, Model, Registration, Verdict
 

@@ -17,12 +17,12 @@ import pytest
 from rrd import rrd_columns, rrd_entities
 from test_recording import BLOB, blob, source, step_of, tracked
 
-import streamtrack.live_server as live_server
-import streamtrack.live_view as live_view
+import streamtrack.recording.live_server as live_server
+import streamtrack.recording.live_view as live_view
 from streamtrack.errors import OutputError, UsageError
 from streamtrack.geometry import scaling, transform_points
-from streamtrack.live_server import LiveAddress, parse_live
-from streamtrack.live_view import LiveView
+from streamtrack.recording.live_server import LiveAddress, parse_live
+from streamtrack.recording.live_view import LiveView
 from streamtrack.settings import Settings
 from streamtrack.types import CameraPose, Frame, Step
 from streamtrack.viewer import viewer_executable
@@ -279,8 +279,8 @@ def test_frozen_and_killed_viewers_slow_nothing(address, monkeypatch, caplog):
 ORPHAN = """
 import sys, time
 from test_recording import Settings, source
-from streamtrack.live_server import LiveAddress
-from streamtrack.live_view import LiveView
+from streamtrack.recording.live_server import LiveAddress
+from streamtrack.recording.live_view import LiveView
 live = LiveView(LiveAddress(port=int(sys.argv[1])), source(), Settings(), [])
 print(live._server._process.pid, flush=True)
 time.sleep(60)

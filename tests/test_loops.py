@@ -9,7 +9,7 @@ import pytest
 from conftest import Clip
 
 from streamtrack import geometry
-from streamtrack.camera import MovingCamera
+from streamtrack.camera.moving import MovingCamera
 from streamtrack.evaluation import corner_error
 from streamtrack.features import FeatureExtractor
 from streamtrack.frame_view import FrameView
@@ -99,7 +99,7 @@ def test_closing_twice_is_harmless(make_clip: MakeClip) -> None:
 def test_a_failure_in_the_thread_is_not_lost(
     make_clip: MakeClip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("streamtrack.keyframe_links.overlapping", lambda *_: 1 / 0)
+    monkeypatch.setattr("streamtrack.camera.keyframe_links.overlapping", lambda *_: 1 / 0)
     clip = make_clip(LOOP, 64)
     with pytest.raises(ZeroDivisionError):
         fly(clip, is_live=True)

@@ -10,7 +10,6 @@ from rerun.chunk import RrdReader
 from rrd import rrd_columns, rrd_entities
 from test_recording import BLOB, SIZE, blob, picture, source, step_of, tracked
 
-from streamtrack import recorded_pictures
 from streamtrack.errors import OutputError
 from streamtrack.geometry import box_quad, scaling, transform_points, translation
 from streamtrack.mosaic.types import (
@@ -21,8 +20,9 @@ from streamtrack.mosaic.types import (
     Placement,
     Status,
 )
-from streamtrack.recorded_pictures import record_picture_mosaic
-from streamtrack.recording import Recorder
+from streamtrack.recording import pictures as recorded_pictures
+from streamtrack.recording.pictures import record_picture_mosaic
+from streamtrack.recording.recorder import Recorder
 from streamtrack.settings import Settings, build_settings
 from streamtrack.types import CameraPose, Features, Matches, Model, Registration, Verdict
 from streamtrack.world import WorldMotion, crossing

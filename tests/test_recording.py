@@ -22,13 +22,13 @@ import pytest
 from rerun.chunk import RrdReader
 from rrd import rrd_columns, rrd_entities, rrd_timelines
 
-import streamtrack.recorded_video as recorded_video
-import streamtrack.recording as recording
+import streamtrack.recording.recorder as recording
+import streamtrack.recording.video as recorded_video
 import streamtrack.viewer as viewer
-from streamtrack.blueprint import TargetEntities
 from streamtrack.errors import OutputError, SourceError
 from streamtrack.geometry import box_quad, transform_points, translation
-from streamtrack.recording import Recorder, view
+from streamtrack.recording.blueprint import TargetEntities
+from streamtrack.recording.recorder import Recorder, view
 from streamtrack.settings import Settings, build_settings
 from streamtrack.types import (
     CameraPose,

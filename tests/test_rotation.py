@@ -25,12 +25,12 @@ from test_recording import (
     step_of,
 )
 
-import streamtrack.repair as repair
-import streamtrack.rotation as rotation
+import streamtrack.recording.repair as repair
+import streamtrack.recording.series as rotation
 from streamtrack.errors import OutputError, UsageError
-from streamtrack.recording import Recorder
-from streamtrack.repair import is_whole, mend
-from streamtrack.rotation import FileSeries, Hold, Limit, parse_limit
+from streamtrack.recording.recorder import Recorder
+from streamtrack.recording.repair import is_whole, mend
+from streamtrack.recording.series import FileSeries, Hold, Limit, parse_limit
 from streamtrack.settings import build_settings
 
 
@@ -289,7 +289,7 @@ def test_a_full_disk_is_a_gap_between_files(tmp_path, monkeypatch, caplog):
         os, "statvfs", lambda _: SimpleNamespace(f_bavail=free["blocks"], f_frsize=4096)
     )
     now = {"s": 0.0}
-    monkeypatch.setattr("streamtrack.recording.time.monotonic", lambda: now["s"])
+    monkeypatch.setattr("streamtrack.recording.recorder.time.monotonic", lambda: now["s"])
     settings = rotating(rotate="1h")
     with Recorder(tmp_path / "cam.rrd", source(), settings, ["board"]) as recorder:
         recorder.log(step_of(0))
@@ -485,7 +485,7 @@ def test_log_lines_of_other_threads_never_block_the_tracker(tmp_path):
 def _log_inside(recorder, index):
     with recorder._lock:
         time.sleep(0.0002)
-        logging.getLogger("streamtrack.recording").warning("%d", index)
+        logging.getLogger("streamtrack.recording.recorder").warning("%d", index)
 
 
 def test_series_survive_a_file_that_vanishes(tmp_path, monkeypatch):

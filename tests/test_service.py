@@ -14,8 +14,8 @@ import streamtrack.service as service
 import streamtrack.targets
 from streamtrack import cli
 from streamtrack.errors import UsageError
-from streamtrack.live_server import LiveAddress
-from streamtrack.rotation import parse_rotate
+from streamtrack.recording.live_server import LiveAddress
+from streamtrack.recording.series import parse_rotate
 from streamtrack.service import ServiceNotifier
 
 

@@ -8,10 +8,10 @@ import pytest
 from conftest import MakePicture
 
 from streamtrack import geometry
+from streamtrack.camera.view_alignment import align, align_exactly
+from streamtrack.camera.view_levels import ReferenceView, ViewLevels
 from streamtrack.evaluation import corner_error
 from streamtrack.types import Image, Matrix, Size, Verdict
-from streamtrack.view_alignment import align, align_exactly
-from streamtrack.view_levels import ReferenceView, ViewLevels
 
 SIZE = (640, 480)
 

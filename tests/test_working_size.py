@@ -10,7 +10,7 @@ import pytest
 from conftest import Clip, FrameList
 
 from streamtrack import geometry
-from streamtrack.camera import MovingCamera
+from streamtrack.camera.moving import MovingCamera
 from streamtrack.errors import TargetError
 from streamtrack.pipeline import track
 from streamtrack.settings import METHODS, build_settings

@@ -10,9 +10,9 @@ import pytest
 from conftest import FrameList, MakeHomography, MakePicture
 
 from streamtrack import geometry
+from streamtrack.camera.keyframes import KeyframeGraph
 from streamtrack.errors import UsageError
 from streamtrack.ground import Ground, fit_ground, make_ground, parse_ground
-from streamtrack.keyframes import KeyframeGraph
 from streamtrack.pipeline import track
 from streamtrack.results import GROUND_COLUMNS, TRACK_COLUMNS, open_tracks_writer
 from streamtrack.settings import build_settings

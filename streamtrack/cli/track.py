@@ -54,8 +54,8 @@ def track(
         str | None,
         typer.Option(
             help="fixed (watched, and said if it is not), moving, or auto: finds out, also when it "
-            "changes. Default fixed; auto where --mosaic, --stabilize, --poses, --scale or "
-            "--ground ask for the world.",
+            "changes. Default fixed; auto with --target auto and where --mosaic, --stabilize, "
+            "--poses, --scale or --ground ask for the world.",
         ),
     ] = None,
     scale: Annotated[
@@ -152,6 +152,7 @@ def track(
     """Follow targets through a video and write a recording, tables and a summary."""
     from streamtrack.ground import make_ground, parse_ground
     from streamtrack.settings import WorldSettings
+    from streamtrack.targets import auto_target, parse_targets
 
     known = parse_ground(ground) if ground else None
     if stabilize_path is not None and stabilize is None:
@@ -173,12 +174,13 @@ def track(
         },
     )
     make_ground(chosen.world)  # what is wrong with the known points is said at once
+    targets = parse_targets(target)
+    finds_targets = auto_target(targets) is not None  # against the background, wherever that goes
     is_world_wanted = bool(mosaic or poses or stabilize or chosen.world != WorldSettings())
-    if is_world_wanted and "camera" not in chosen.model_fields_set:
+    if (finds_targets or is_world_wanted) and "camera" not in chosen.model_fields_set:
         chosen = chosen.model_copy(update={"camera": "auto"})
     from streamtrack.job import TrackJob, run_track
-    from streamtrack.live_server import parse_live
-    from streamtrack.targets import parse_targets
+    from streamtrack.recording.live_server import parse_live
     from streamtrack.watching import Outputs
 
     if no_record and record is not None:
@@ -188,7 +190,7 @@ def track(
     address = None if live is None else parse_live(live)
     job = TrackJob(
         source,
-        parse_targets(target),
+        targets,
         chosen,
         Outputs(
             None if no_record else record, output, poses, video, summary, mosaic, address, stabilize

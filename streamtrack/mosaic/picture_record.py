@@ -55,7 +55,7 @@ def record_run(
     summary: MosaicSummary,
 ) -> None:
     """Write the recording of a run, whatever came of it. Raises OutputError, SourceError."""
-    from streamtrack.recorded_pictures import record_picture_mosaic
+    from streamtrack.recording.pictures import record_picture_mosaic
 
     is_painted = canvas is not None and copy is not None
     record_picture_mosaic(

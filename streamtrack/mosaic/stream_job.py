@@ -14,7 +14,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from streamtrack.camera import MovingCamera
+from streamtrack.camera.moving import MovingCamera
 from streamtrack.errors import OutputError, SourceError, StreamtrackError, UsageError
 from streamtrack.features import FeatureExtractor
 from streamtrack.frame_view import FrameView
@@ -29,7 +29,7 @@ from streamtrack.sources.base import FrameSource
 from streamtrack.types import CameraPose, Frame, SourceInfo, Step
 
 if TYPE_CHECKING:
-    from streamtrack.recording import Recorder
+    from streamtrack.recording.recorder import Recorder
 
 
 def run_stream_mosaic(
@@ -76,7 +76,7 @@ class _Run:
         self._ended = ""
 
     def _open_recorder(self, path: Path) -> Recorder:
-        from streamtrack.recording import Recorder
+        from streamtrack.recording.recorder import Recorder
 
         return Recorder(path, self._source.info, self._settings, [], has_mosaic=True)
 

@@ -17,7 +17,6 @@ Names are those of the ancestor's front panel. Definitions:
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from dataclasses import dataclass, field
@@ -27,10 +26,15 @@ from typing import Any
 import numpy as np
 
 from streamtrack.mosaic.types import Link, Placement, Status
-from streamtrack.outputs import write_file
 from streamtrack.settings import Settings
+from streamtrack.summary_text import known, markdown, number, write_json
 from streamtrack.types import Matrix, Size
 
+_MORE_LABELS = {
+    "spilled_mb": ("Spilled to disk", " MB"),
+    "ms_per_frame_p95": ("Time a frame, p95", " ms"),
+    "ghost_index_undecided": ("Ghost index, undecided", ""),
+}
 _LONG_LIST = 40
 """So many pictures are named one by one in the printed table; beyond, only those left out."""
 
@@ -89,18 +93,18 @@ class LinkSummary:
             "matches": self.matches,
             "pairs": self.pairs,
             "inliers": self.inliers,
-            "inlier_share": _known(self.inliers / self.pairs if self.pairs else math.nan),
+            "inlier_share": known(self.inliers / self.pairs if self.pairs else math.nan),
             "inlier_threshold_px": threshold_px,
-            "rmse_px": _known(self.rmse_px),
+            "rmse_px": known(self.rmse_px),
             "rmse_definition": "symmetric transfer RMSE of the inliers, in px of each picture",
-            "overlap_ncc": _known(self.overlap_ncc),
+            "overlap_ncc": known(self.overlap_ncc),
             "model": self.model or None,
             "verdict": self.verdict,
             "is_loop": self.is_loop,
-            "recall": _known(self.recall),
-            "one_minus_precision": _known(self.one_minus_precision),
+            "recall": known(self.recall),
+            "one_minus_precision": known(self.one_minus_precision),
             "recall_definition": "correct matches / correspondences (Mikolajczyk & Schmid 2005)",
-            "corner_error_px": _known(self.corner_error_px),
+            "corner_error_px": known(self.corner_error_px),
             "b_from_a": matrix,
         }
 
@@ -151,7 +155,7 @@ class MosaicSummary:
             "warping": mosaic.warping,
             "blending": mosaic.blending,
             "projection": self.projection,
-            "focal_px": _known(self.focal_px),
+            "focal_px": known(self.focal_px),
             "reference": self.reference,
             "images": [_image_json(image) for image in self.images],
             "links": [link.to_json(threshold_px) for link in self.links],
@@ -159,12 +163,12 @@ class MosaicSummary:
             "canvas": None
             if canvas is None
             else {"width": canvas[0], "height": canvas[1], "scale": self.scale},
-            "rmse_px": _known(self.rmse_px),
-            "overlap_ncc": _known(self.overlap_ncc),
-            "time_s": _known(self.time_s),
-            "cpu_s": _known(self.cpu_s),
-            "ms_per_frame": _known(self.ms_per_frame),
-            "peak_rss_mb": _known(self.peak_rss_mb),
+            "rmse_px": known(self.rmse_px),
+            "overlap_ncc": known(self.overlap_ncc),
+            "time_s": known(self.time_s),
+            "cpu_s": known(self.cpu_s),
+            "ms_per_frame": known(self.ms_per_frame),
+            "peak_rss_mb": known(self.peak_rss_mb),
             "ended": self.ended,
             "notes": list(self.notes),
             **self.more,
@@ -183,13 +187,13 @@ class MosaicSummary:
             ("Projection", self._projection_text()),
             ("Warping", f"backward, {mosaic.warping}"),
             ("Blending", mosaic.blending),
-            ("RMSE of the mosaic", _number(self.rmse_px, 2, " px")),
-            ("Overlap NCC", _number(self.overlap_ncc, 3)),
+            ("RMSE of the mosaic", number(self.rmse_px, 2, " px")),
+            ("Overlap NCC", number(self.overlap_ncc, 3)),
             *self._image_rows(),
             ("Mosaic", self._canvas_text()),
         ]
         rows += [
-            (key.replace("_", " ").capitalize(), str(value))
+            _more_row(key, value)
             for key, value in self.more.items()
             if not key.endswith("_definition")
         ]
@@ -197,7 +201,7 @@ class MosaicSummary:
         if self.ms_per_frame is not None:
             rows.append(("Time a frame", f"{self.ms_per_frame:.1f} ms"))
         rows.append(("Time", f"{self.time_s:.2f} s, CPU {self.cpu_s:.2f} s"))
-        rows.append(("Peak memory", _number(self.peak_rss_mb, 0, " MB")))
+        rows.append(("Peak memory", number(self.peak_rss_mb, 0, " MB")))
         if self.ended:
             rows.append(("Ended", self.ended))
         return rows
@@ -249,14 +253,12 @@ class MosaicSummary:
 
     def to_markdown(self) -> str:
         """The table as Markdown."""
-        lines = ["# Mosaic summary", "", "| what | value |", "|---|---|"]
-        lines += [f"| {_cell(label)} | {_cell(value)} |" for label, value in self.rows()]
+        lines = markdown("Mosaic summary", self.rows())
         return "\n".join(lines) + "\n"
 
     def write_json(self, path: Path) -> None:
         """Write `to_json` as a whole file or not at all. Raises OutputError."""
-        text = json.dumps(self.to_json(), indent=2, ensure_ascii=False, allow_nan=False)
-        write_file(path, (text + "\n").encode("utf-8", "replace"))
+        write_json(path, self.to_json())
 
 
 def _link_rows(
@@ -267,7 +269,7 @@ def _link_rows(
         ("Features", f"{features.get(link.a, 0)} and {features.get(link.b, 0)}"),
         ("Matches", str(link.matches)),
         ("Inliers", f"{link.inliers} of {link.pairs} pairs{share} within {threshold_px:g} px"),
-        ("RMSE of the inliers", f"{_number(link.rmse_px, 3, ' px')} (symmetric transfer)"),
+        ("RMSE of the inliers", f"{number(link.rmse_px, 3, ' px')} (symmetric transfer)"),
     ]
     if link.verdict != "ok":
         rows.append(("Refused", link.verdict))
@@ -279,6 +281,11 @@ def _link_rows(
     return rows
 
 
+def _more_row(key: str, value: Any) -> tuple[str, str]:
+    label, unit = _MORE_LABELS.get(key, (key.replace("_", " ").capitalize(), ""))
+    return label, "-" if value is None else f"{value}{unit}"
+
+
 def _image_json(image: Placement) -> dict[str, Any]:
     matrix = image.world_from_picture
     return {
@@ -287,23 +294,10 @@ def _image_json(image: Placement) -> dict[str, Any]:
         "features": image.features,
         "status": image.status.value,
         "reason": image.reason,
-        "time_s": _known(image.time_s),
+        "time_s": known(image.time_s),
         "world_from_frame": None if matrix is None else np.asarray(matrix).tolist(),
     }
 
 
-def _known(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)
-
-
-def _number(value: float | None, decimals: int, unit: str = "") -> str:
-    known = _known(value)
-    return "-" if known is None else f"{known:.{decimals}f}{unit}"
-
-
 def _range_text(counts: list[int], unit: str) -> str:
     return f"{min(counts)} to {max(counts)}{unit}"
-
-
-def _cell(text: str) -> str:
-    return " ".join(text.split()).replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;")

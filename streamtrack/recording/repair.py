@@ -13,7 +13,7 @@ import threading
 from pathlib import Path
 
 from streamtrack.errors import StreamtrackError
-from streamtrack.rotation import held
+from streamtrack.recording.series import held
 from streamtrack.viewer import viewer_executable
 
 _END_MAGIC = b"RRF2FOOT"

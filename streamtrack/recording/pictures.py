@@ -20,12 +20,12 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
-from streamtrack import blueprint, recorded_rows
 from streamtrack.errors import OutputError
 from streamtrack.geometry import scaling, transform_points
 from streamtrack.mosaic.types import Link, Picture, Placement, Status
-from streamtrack.recorded_file import RecordingFiles, free_bytes, new_stream, reserve_bytes
-from streamtrack.recorded_video import jpeg_of
+from streamtrack.recording import blueprint, rows
+from streamtrack.recording.file import RecordingFiles, free_bytes, new_stream, reserve_bytes
+from streamtrack.recording.video import jpeg_of
 from streamtrack.types import Image, Points, Size, Verdict
 
 _TIMELINE = "picture"
@@ -146,7 +146,7 @@ def _log_picture(stream: rr.RecordingStream, picture: Picture) -> None:
     path = f"pictures/{picture.index}/keypoints"
     points = transform_points(scaling(factor), picture.features.points)
     classes = np.full(len(points), blueprint.UNMATCHED, np.uint16)
-    stream.log(path, recorded_rows.points(points, classes), static=True)
+    stream.log(path, rows.points(points, classes), static=True)
     style = rr.Points2D.from_fields(
         radii=blueprint.ui_points(1.5), show_labels=False, draw_order=20
     )
@@ -174,7 +174,7 @@ def _log_link(stream: rr.RecordingStream, link: Link, a: Picture, b: Picture) ->
     lines: npt.NDArray[np.float32] = np.stack([start, end], axis=1).astype(np.float32)
     is_inlier = link.registration.is_inlier[order]
     classes = np.where(is_inlier, blueprint.INLIER, blueprint.OUTLIER).astype(np.uint16)
-    stream.log(f"{path}/matches", recorded_rows.strips(lines, classes), static=True)
+    stream.log(f"{path}/matches", rows.strips(lines, classes), static=True)
     style = rr.LineStrips2D.from_fields(
         radii=blueprint.ui_points(0.5), show_labels=False, draw_order=10
     )

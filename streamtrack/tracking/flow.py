@@ -15,14 +15,14 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.blur import motion_blur, with_best_length
 from streamtrack.fitting import fit, gauss_newton_step, poorest_model, transfer_errors
 from streamtrack.frame_view import FrameView
-from streamtrack.likeness import local_correlation, matched_in_grey, moved_by
-from streamtrack.refine import Prior, refined
 from streamtrack.registration import Effort, judge_mapping, refused, register
 from streamtrack.settings import RegistrationSettings
-from streamtrack.template import Patch, Template
+from streamtrack.tracking.blur import motion_blur, with_best_length
+from streamtrack.tracking.likeness import local_correlation, matched_in_grey, moved_by
+from streamtrack.tracking.refine import Prior, refined
+from streamtrack.tracking.template import Patch, Template
 from streamtrack.types import Image, Mask, Matrix, Model, Points, Registration, Verdict
 
 Floats = npt.NDArray[np.float32]

@@ -19,13 +19,13 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.keyframes import Keyframe, KeyframeGraph
+from streamtrack.camera.keyframes import Keyframe, KeyframeGraph
+from streamtrack.camera.view_alignment import align, align_exactly
+from streamtrack.camera.view_levels import ReferenceView, ViewLevels
+from streamtrack.camera.view_verdict import ViewAlignment
 from streamtrack.mosaic.adjustment import adjust
 from streamtrack.mosaic.types import Link
 from streamtrack.types import Matches, Matrix, Model, Registration, Size
-from streamtrack.view_alignment import align, align_exactly
-from streamtrack.view_levels import ReferenceView, ViewLevels
-from streamtrack.view_verdict import ViewAlignment
 
 _MIN_LINK_OVERLAP = 0.25
 _MAX_NEIGHBOURS = 1  # taken shortly before, beside the one that the keyframe was measured against

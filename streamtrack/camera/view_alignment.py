@@ -20,10 +20,18 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
+from streamtrack.camera.view_levels import (
+    EDGE_PX,
+    EXACT,
+    USUAL,
+    Floats,
+    Pixels,
+    ReferenceView,
+    ViewLevels,
+)
+from streamtrack.camera.view_verdict import Fitted, ViewAlignment, judged, refusal
 from streamtrack.registration import judge_mapping
 from streamtrack.types import Mask, Matrix, Points, Verdict
-from streamtrack.view_levels import EDGE_PX, EXACT, USUAL, Floats, Pixels, ReferenceView, ViewLevels
-from streamtrack.view_verdict import Fitted, ViewAlignment, judged, refusal
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 

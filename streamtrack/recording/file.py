@@ -11,9 +11,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 import rerun_bindings
 
-from streamtrack.blueprint import APPLICATION_ID
 from streamtrack.errors import OutputError
-from streamtrack.rotation import Hold
+from streamtrack.recording.blueprint import APPLICATION_ID
+from streamtrack.recording.series import Hold
 
 _FLUSH_EVERY_S = 0.2
 _FLUSH_BYTES = 1 << 24

@@ -14,10 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from streamtrack import geometry
-from streamtrack.flow import Alignment, FlowAligner, Hope, agreeing_share
 from streamtrack.frame_view import FrameView
 from streamtrack.settings import RegistrationSettings
-from streamtrack.template import MIN_FLOW_POINTS, Template, make_passing_patches
+from streamtrack.tracking.flow import Alignment, FlowAligner, Hope, agreeing_share
+from streamtrack.tracking.template import MIN_FLOW_POINTS, Template, make_passing_patches
 from streamtrack.types import Image, Matrix, Model, Points
 
 MIN_VIEW_SHARE = 0.6

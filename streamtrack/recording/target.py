@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import rerun as rr
 
-from streamtrack import blueprint, recorded_rows
-from streamtrack.blueprint import TargetEntities
 from streamtrack.geometry import bounding_box, inverted, scaling, transform_points, translation
-from streamtrack.recorded_video import jpeg_of
+from streamtrack.recording import blueprint, rows
+from streamtrack.recording.blueprint import TargetEntities
+from streamtrack.recording.video import jpeg_of
 from streamtrack.types import Image, Matrix, Points, Size, Step, Track, TrackState
 
 _CLOSE_UP_EVERY = 5
@@ -80,8 +80,8 @@ class TargetLog:
 
     def _log_quad(self, quad: Points) -> None:
         outline = np.concatenate([quad, quad[:1]])[None]
-        self._stream.log(self._entities.quad, recorded_rows.strips(outline))
-        self._stream.log(self._entities.corners, recorded_rows.points(quad))
+        self._stream.log(self._entities.quad, rows.strips(outline))
+        self._stream.log(self._entities.corners, rows.points(quad))
 
     def _log_numbers(self, track: Track) -> None:
         is_tracking = track.state is TrackState.TRACKING
@@ -91,7 +91,7 @@ class TargetLog:
             (self._entities.rmse_px, track.rmse_px),
             (self._entities.correlation, track.correlation),
         ):
-            self._stream.log(path, recorded_rows.scalar(value if is_tracking else math.nan))
+            self._stream.log(path, rows.scalar(value if is_tracking else math.nan))
 
     def _log_close_up(self, image: Image, track: Track) -> None:
         if self._frames_to_close_up > 0:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from streamtrack.template import CORRELATION_WINDOW, Patch
+from streamtrack.tracking.template import CORRELATION_WINDOW, Patch
 from streamtrack.types import Image, Mask
 
 Floats = npt.NDArray[np.float32]

@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 import rerun as rr
 
-from streamtrack.blueprint import IMAGE
 from streamtrack.errors import OutputError
+from streamtrack.recording.blueprint import IMAGE
 from streamtrack.settings import RecordingSettings, VideoMode
 from streamtrack.sources.encoder import Av1Encoder
 from streamtrack.types import Frame, Image, Packet, Size, SourceInfo
 
-_log = logging.getLogger("streamtrack.recording")
+_log = logging.getLogger("streamtrack.recording.recorder")
 
 _CODECS = {
     "h264": rr.VideoCodec.H264,

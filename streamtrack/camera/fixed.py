@@ -15,12 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from streamtrack import geometry
+from streamtrack.camera.keyframes import KeyframeGraph
+from streamtrack.camera.standing import StandCheck
+from streamtrack.camera.view_alignment import align
+from streamtrack.camera.view_levels import ReferenceView, ViewLevels
 from streamtrack.frame_view import FrameView
-from streamtrack.keyframes import KeyframeGraph
-from streamtrack.standing import StandCheck
 from streamtrack.types import CameraPose, Frame, Image, Points, Track
-from streamtrack.view_alignment import align
-from streamtrack.view_levels import ReferenceView, ViewLevels
 
 _EVERY = 25  # frames between two checks
 _GLANCE_EVERY = 5

@@ -16,21 +16,21 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from streamtrack import blueprint
 from streamtrack.errors import OutputError
 from streamtrack.mosaic.types import MosaicView
-from streamtrack.recorded_file import RecordingFiles, free_bytes, new_stream, reserve_bytes
-from streamtrack.recorded_steps import StepLog
-from streamtrack.recorded_video import Clock, open_video
-from streamtrack.repair import is_whole, mend
-from streamtrack.rotation import FileSeries, Limit, check_keep, parse_keep, parse_rotate
+from streamtrack.recording import blueprint
+from streamtrack.recording.file import RecordingFiles, free_bytes, new_stream, reserve_bytes
+from streamtrack.recording.repair import is_whole, mend
+from streamtrack.recording.series import FileSeries, Limit, check_keep, parse_keep, parse_rotate
+from streamtrack.recording.steps import StepLog
+from streamtrack.recording.video import Clock, open_video
 from streamtrack.settings import Settings
 from streamtrack.types import Image, Matrix, Size, SourceInfo, Step
 from streamtrack.viewer import view
 
 __all__ = ["Recorder", "RunLogHandler", "timeline_of", "view"]
 
-_log = logging.getLogger("streamtrack.recording")
+_log = logging.getLogger("streamtrack.recording.recorder")
 
 _MEND = "'rerun rrd optimize FILE -o WHOLE' makes the file so far whole"
 _RESUME_EVERY_S = 60.0
@@ -54,7 +54,7 @@ class Recorder:
     """Writes each `Step` of a run to an .rrd file, with the layout to view it in.
 
     With ``settings.recording.rotate`` it becomes a series of files beside ``path``, each complete
-    by itself (`streamtrack.rotation`); with ``keep`` the oldest of them are removed.
+    by itself (`streamtrack.recording.series`); with ``keep`` the oldest of them are removed.
     ``template_views`` are the targets' pictures as they were given, by name; a target without one
     gets its first close-up instead. Log records of the logger ``streamtrack`` go in as well.
     ``path`` is the file that is being written; ``failed`` says why recording ended early, and is

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
-from streamtrack import blueprint, recorded_rows
+from streamtrack.recording import blueprint, rows
 from streamtrack.types import Step, Track, TrackState
 
 
@@ -53,7 +53,7 @@ class FoundLog:
             states = [shown.state for shown in self._alive.values()]
             for state in (TrackState.TRACKING, TrackState.LOST):
                 path = f"{blueprint.FOUND_CURVES}/{state}"
-                self._stream.log(path, recorded_rows.scalar(states.count(state)))
+                self._stream.log(path, rows.scalar(states.count(state)))
         return [line for line in lines if line]
 
     def _follow(self, frame: int, track: Track) -> str:
@@ -73,7 +73,7 @@ class FoundLog:
         if track.quad is not None:
             shown.frames += 1
             outline = np.concatenate([track.quad, track.quad[:1]])[None]
-            self._stream.log(_quad_path(track.name), recorded_rows.strips(outline))
+            self._stream.log(_quad_path(track.name), rows.strips(outline))
         elif was is TrackState.TRACKING:
             self._clear(track.name)
         return message

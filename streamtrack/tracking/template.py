@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.blur import smeared_along
 from streamtrack.errors import TargetError
 from streamtrack.features import FeatureExtractor
 from streamtrack.pyramid import Pyramid
-from streamtrack.refine import Gradients, changed_gradients, make_gradients
+from streamtrack.tracking.blur import smeared_along
+from streamtrack.tracking.refine import Gradients, changed_gradients, make_gradients
 from streamtrack.types import Features, Image, Mask, Matrix, Points, Size
 
 PATCH_AREA_PX = 36_000

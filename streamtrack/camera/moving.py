@@ -16,18 +16,18 @@ from typing import Protocol
 import numpy as np
 
 from streamtrack import geometry
+from streamtrack.camera.keyframe_links import LevelCache, NewKeyframe, link_of, overlapping
+from streamtrack.camera.keyframes import KeyframeGraph
+from streamtrack.camera.loops import LoopCloser
+from streamtrack.camera.relocalising import Relocaliser
+from streamtrack.camera.view_alignment import align, align_exactly
+from streamtrack.camera.view_levels import ReferenceView, ViewLevels
+from streamtrack.camera.view_verdict import ViewAlignment
 from streamtrack.fitting import fit
 from streamtrack.frame_view import FrameView
-from streamtrack.keyframe_links import LevelCache, NewKeyframe, link_of, overlapping
-from streamtrack.keyframes import KeyframeGraph
-from streamtrack.loops import LoopCloser
 from streamtrack.mosaic.types import Link
-from streamtrack.relocalising import Relocaliser
 from streamtrack.settings import Settings
 from streamtrack.types import CameraPose, Matrix, Model, Points, Size, Track, Verdict
-from streamtrack.view_alignment import align, align_exactly
-from streamtrack.view_levels import ReferenceView, ViewLevels
-from streamtrack.view_verdict import ViewAlignment
 
 _MIN_OVERLAP = 0.6
 _MIN_OVERLAP_UNSHARP = 0.45  # below which a blurred frame, too, becomes a keyframe

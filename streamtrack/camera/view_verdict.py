@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
+from streamtrack.camera.view_levels import USUAL, Floats, Pixels, ReferenceView, ViewLevels
 from streamtrack.registration import judge_mapping
 from streamtrack.types import Mask, Matrix, Points, Size, Verdict
-from streamtrack.view_levels import USUAL, Floats, Pixels, ReferenceView, ViewLevels
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 

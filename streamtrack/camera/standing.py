@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
+from streamtrack.camera.view_levels import USUAL, Pixels, ReferenceView, ViewLevels
 from streamtrack.types import Points
-from streamtrack.view_levels import USUAL, Pixels, ReferenceView, ViewLevels
 
 _LEVEL = 2
 _MIN_PIXELS = 120

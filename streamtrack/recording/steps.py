@@ -16,13 +16,13 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from streamtrack import blueprint, recorded_rows
 from streamtrack.errors import OutputError
-from streamtrack.recorded_found import FoundLog
-from streamtrack.recorded_mosaic import MosaicLog
-from streamtrack.recorded_target import TargetLog
-from streamtrack.recorded_tracks import TracksTable
-from streamtrack.recorded_video import Clock, Video, without_video
+from streamtrack.recording import blueprint, rows
+from streamtrack.recording.found import FoundLog
+from streamtrack.recording.mosaic import MosaicLog
+from streamtrack.recording.target import TargetLog
+from streamtrack.recording.tracks import TracksTable
+from streamtrack.recording.video import Clock, Video, without_video
 from streamtrack.settings import Settings, WorldSettings
 from streamtrack.types import (
     Frame,
@@ -36,7 +36,7 @@ from streamtrack.types import (
     TrackState,
 )
 
-_log = logging.getLogger("streamtrack.recording")
+_log = logging.getLogger("streamtrack.recording.recorder")
 
 
 class StepLog:
@@ -157,7 +157,7 @@ class StepLog:
                 blueprint.log_stage_style(self._stream, path, name, number)
             if self._counts.get(name) != count:
                 self._counts[name] = count
-                self._stream.log(path, recorded_rows.scalar(count))
+                self._stream.log(path, rows.scalar(count))
 
     def log_mosaic_frame(
         self,
@@ -256,7 +256,7 @@ class StepLog:
         if agreeing:
             paired = np.concatenate(agreeing)
             classes[len(points) - len(paired) :] = paired
-        self._stream.log(blueprint.KEYPOINTS, recorded_rows.points(points, classes))
+        self._stream.log(blueprint.KEYPOINTS, rows.points(points, classes))
         self._log_lines(step.tracks)
 
     def _log_lines(self, tracks: Sequence[Track]) -> None:
@@ -271,20 +271,20 @@ class StepLog:
                 lines.append(np.stack([start, track.evidence.frame_points], axis=1))
                 classes.append(_classes(track.evidence.is_inlier))
         self._stream.log(
-            blueprint.MATCHES, recorded_rows.strips(np.concatenate(lines), np.concatenate(classes))
+            blueprint.MATCHES, rows.strips(np.concatenate(lines), np.concatenate(classes))
         )
 
     def _log_times(self, step: Step) -> None:
         if step.features is not None:
-            self._stream.log(blueprint.FEATURE_COUNT, recorded_rows.scalar(len(step.features)))
+            self._stream.log(blueprint.FEATURE_COUNT, rows.scalar(len(step.features)))
         captured = step.frame.captured_unix_s
         if captured is not None:
             age_ms = 1e3 * (time.time() - captured)
-            self._stream.log(blueprint.AGE_MS, recorded_rows.scalar(age_ms))
+            self._stream.log(blueprint.AGE_MS, rows.scalar(age_ms))
         for stage, milliseconds in step.stage_ms.items():
-            self._stream.log(self._stage_path(stage), recorded_rows.scalar(milliseconds))
+            self._stream.log(self._stage_path(stage), rows.scalar(milliseconds))
         for stage in self._last_stages - step.stage_ms.keys():
-            self._stream.log(self._stage_path(stage), recorded_rows.scalar(math.nan))
+            self._stream.log(self._stage_path(stage), rows.scalar(math.nan))
         self._last_stages = set(step.stage_ms)
 
     def _stage_path(self, stage: str) -> str:

@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from streamtrack import blueprint, recorded_rows
-from streamtrack.blueprint import TargetEntities
 from streamtrack.geometry import box_quad, inverted, scaling, transform_points
 from streamtrack.mosaic.types import MosaicView
-from streamtrack.recorded_video import jpeg_of
+from streamtrack.recording import blueprint, rows
+from streamtrack.recording.blueprint import TargetEntities
+from streamtrack.recording.video import jpeg_of
 from streamtrack.types import Image, Matrix, Points, Size, Step
 from streamtrack.world import WorldPlace
 
@@ -141,7 +141,7 @@ class MosaicLog:
             self._shown_state = state
             self._stream.log(blueprint.MOSAIC_STATE, rr.StateChange(state=state))
         for name, value in metrics.items():
-            self._stream.log(self._curve_path(name), recorded_rows.scalar(value))
+            self._stream.log(self._curve_path(name), rows.scalar(value))
         if world_from_frame is not None:
             corners = box_quad(0, 0, size_wh[0] - 1, size_wh[1] - 1)
             self._log_outline(transform_points(world_from_frame, corners))
@@ -171,11 +171,11 @@ class MosaicLog:
             target.place, target.is_shown = place, True
             if self._preview_from_world is not None:
                 position = transform_points(self._preview_from_world, place.position)
-                self._stream.log(target.entities.mosaic_position, recorded_rows.points(position))
+                self._stream.log(target.entities.mosaic_position, rows.points(position))
         for name, target in self._targets.items():
             if target.is_shown and name not in self._places:
                 target.is_shown = False
-                nowhere = recorded_rows.points(np.zeros((0, 2), np.float32))
+                nowhere = rows.points(np.zeros((0, 2), np.float32))
                 self._stream.log(target.entities.mosaic_position, nowhere)
 
     def _target(self, name: str, place: WorldPlace) -> _Target:
@@ -198,7 +198,7 @@ class MosaicLog:
             self._log_strips(blueprint.MOSAIC_FRAME, _closed(quads))
 
     def _log_strips(self, path: str, strips: npt.NDArray[np.float32]) -> None:
-        self._stream.log(path, recorded_rows.strips(strips))
+        self._stream.log(path, rows.strips(strips))
 
     def _curve_path(self, name: str) -> str:
         if name not in self._curves:

@@ -23,15 +23,15 @@ from typing import Self
 import rerun as rr
 import rerun_bindings
 
-from streamtrack import blueprint
 from streamtrack.errors import OutputError
 from streamtrack.geometry import inverted, scaling
-from streamtrack.live_server import LiveAddress, LiveServer, ServerError, check_free
 from streamtrack.mosaic.types import MosaicView
-from streamtrack.recorded_file import Layout, new_stream
-from streamtrack.recorded_steps import StepLog
-from streamtrack.recorded_video import Clock, jpeg_video
-from streamtrack.recording import RunLogHandler, timeline_of
+from streamtrack.recording import blueprint
+from streamtrack.recording.file import Layout, new_stream
+from streamtrack.recording.live_server import LiveAddress, LiveServer, ServerError, check_free
+from streamtrack.recording.recorder import RunLogHandler, timeline_of
+from streamtrack.recording.steps import StepLog
+from streamtrack.recording.video import Clock, jpeg_video
 from streamtrack.settings import Settings
 from streamtrack.types import Image, Matrix, Size, SourceInfo, Step
 from streamtrack.working_size import mapped_features, mapped_track, resized

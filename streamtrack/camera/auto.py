@@ -14,14 +14,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from streamtrack import geometry
-from streamtrack.camera import CameraEstimator, MovingCamera
-from streamtrack.fixed_camera import FixedCamera
+from streamtrack.camera.fixed import FixedCamera
+from streamtrack.camera.keyframes import KeyframeGraph
+from streamtrack.camera.moving import CameraEstimator, MovingCamera
+from streamtrack.camera.standing import Stand, StandCheck
+from streamtrack.camera.view_levels import ViewLevels
 from streamtrack.frame_view import FrameView
-from streamtrack.keyframes import KeyframeGraph
 from streamtrack.settings import Settings
-from streamtrack.standing import Stand, StandCheck
 from streamtrack.types import CameraKind, CameraPose, Matrix, Points, Size, Track, Verdict
-from streamtrack.view_levels import ViewLevels
 
 _STILL_PX = 0.75
 """Poses that differ by more are not those of a camera that stands."""

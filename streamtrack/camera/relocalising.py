@@ -10,13 +10,13 @@ from collections import OrderedDict
 from collections.abc import Iterator
 
 from streamtrack import geometry
+from streamtrack.camera.keyframes import KeyframeGraph
+from streamtrack.camera.view_levels import USUAL, ViewLevels
 from streamtrack.features import FeatureExtractor
-from streamtrack.keyframes import KeyframeGraph
 from streamtrack.matching import match
 from streamtrack.registration import register
 from streamtrack.settings import FeatureSettings, Settings
 from streamtrack.types import Features, Matrix
-from streamtrack.view_levels import USUAL, ViewLevels
 
 _FEATURES = 500
 _KEYFRAMES_A_FRAME = 3

@@ -13,9 +13,9 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
-from streamtrack import keyframe_links
-from streamtrack.keyframe_links import Draft, LevelCache, NewKeyframe
-from streamtrack.keyframes import KeyframeGraph
+from streamtrack.camera import keyframe_links
+from streamtrack.camera.keyframe_links import Draft, LevelCache, NewKeyframe
+from streamtrack.camera.keyframes import KeyframeGraph
 
 _LINK_FRAMES = 4  # after which the result of linking a keyframe is taken over
 _LINKS_A_FRAME = 8  # adjusting so many takes a frame more

@@ -16,19 +16,20 @@ from typing import Protocol
 import numpy as np
 
 from streamtrack import geometry
-from streamtrack.appearance import (
-    MAX_CHROMA_DISTANCE,
-    MAX_CHROMA_DISTANCE_OTHER_CAMERA,
-    chroma_distance,
-)
 from streamtrack.fitting import fit
-from streamtrack.flatness import Flatness
-from streamtrack.flow import Alignment, FlowAligner, Hope, agreeing_share
 from streamtrack.frame_view import FrameView
 from streamtrack.matching import match, match_guided
 from streamtrack.registration import refused, register
 from streamtrack.settings import Settings
-from streamtrack.template import Template
+from streamtrack.tracking.appearance import (
+    MAX_CHROMA_DISTANCE,
+    MAX_CHROMA_DISTANCE_OTHER_CAMERA,
+    chroma_distance,
+)
+from streamtrack.tracking.flatness import Flatness
+from streamtrack.tracking.flow import Alignment, FlowAligner, Hope, agreeing_share
+from streamtrack.tracking.template import Template
+from streamtrack.tracking.views import MIN_VIEW_SHARE, RecentViews
 from streamtrack.types import (
     Evidence,
     Features,
@@ -41,7 +42,6 @@ from streamtrack.types import (
     TrackState,
     Verdict,
 )
-from streamtrack.views import MIN_VIEW_SHARE, RecentViews
 
 _GUIDED_RADIUS_PX = 60.0
 _COAST_FRAMES = 10  # lost frames in which the last pose is still tried

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import rerun as rr
 
-from streamtrack import blueprint
+from streamtrack.recording import blueprint
 from streamtrack.types import Step, Track, TrackState
 
 _EVERY_S = 0.5

@@ -1,0 +1,1 @@
+"""Following one target: `tracker` reads as the method, the other files are its stages."""

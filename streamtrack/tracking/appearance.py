@@ -19,6 +19,12 @@ MAX_CHROMA_DISTANCE_OTHER_CAMERA = 25.0
 """The same where white balance may differ: a template picture from elsewhere."""
 
 
+def prepare_colors(picture: Image) -> None:
+    """Have OpenCV make its CIELAB tables now: 0.1 to 0.2 s that no frame should have to wait."""
+    if picture.ndim == 3:
+        _chroma_at(picture, np.zeros((1, 2), np.float32))
+
+
 def chroma_distance(a: Image, points: Points, b: Image, b_from_a: Matrix, reach_px: float) -> float:
     """Upper quartile of the CIELAB a*, b* distance between two pictures; 0 if either is grey.
 

@@ -25,6 +25,7 @@ from streamtrack.tracking.appearance import (
     MAX_CHROMA_DISTANCE,
     MAX_CHROMA_DISTANCE_OTHER_CAMERA,
     chroma_distance,
+    prepare_colors,
 )
 from streamtrack.tracking.flatness import Flatness
 from streamtrack.tracking.flow import Alignment, FlowAligner, Hope, agreeing_share
@@ -125,6 +126,7 @@ class HybridTracker:
         self._max_chroma_distance = (
             MAX_CHROMA_DISTANCE if is_same_camera else MAX_CHROMA_DISTANCE_OTHER_CAMERA
         )
+        prepare_colors(template.picture)
 
     def update(self, view: FrameView) -> Track:
         was_in_view = self._is_in_view

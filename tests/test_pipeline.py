@@ -6,9 +6,11 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from conftest import Clip, FrameList
+from conftest import Clip, FrameList, MakePicture
 
 from streamtrack.errors import SourceError, TargetError, UsageError
+from streamtrack.features import FeatureExtractor
+from streamtrack.geometry import grey_of
 from streamtrack.pipeline import track
 from streamtrack.settings import METHODS, build_settings
 from streamtrack.sources.base import FrameSource
@@ -199,3 +201,16 @@ def test_the_frames_are_left_as_they_are(clip: Clip) -> None:
     list(track(clip.source(), [Target("t", clip.quad)], settings, frames=4))
     for frame, image in zip(clip.frames, before, strict=False):
         np.testing.assert_array_equal(frame.image, image)
+
+
+def test_a_target_never_seen_is_looked_for_with_all_features(
+    make_clip: Callable[..., Clip], make_picture: MakePicture
+) -> None:
+    """A part of them may never be enough to find it."""
+    clip, settings = make_clip("board", 4), build_settings({})
+    extractor = FeatureExtractor(settings.features)
+    elsewhere = Target("t", picture=make_picture(77, (200, 150)))
+    for step in track(clip.source(), [elsewhere], settings):
+        assert step.tracks[0].state is TrackState.SEARCHING
+        assert step.features is not None
+        assert len(step.features) == len(extractor.extract(grey_of(step.frame.image)))

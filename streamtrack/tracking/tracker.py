@@ -48,6 +48,7 @@ _GUIDED_RADIUS_PX = 60.0
 _COAST_FRAMES = 10  # lost frames in which the last pose is still tried
 _MAX_AREA_JUMP = 1.5  # from the prediction to what is found
 _MIN_RETURN_SHARE = 0.3  # of the points in view, for a target that was lost
+_FULL_SEARCH_EVERY = 24  # searches: less than 5 in 100 frames take longer
 _FIRST_SURPRISE_PX = 5.0
 _MIN_SURPRISE_PX = 2.0
 _THIN_SHARE = 0.33  # inliers of all points, below which hidden corners go by prediction
@@ -293,9 +294,11 @@ class HybridTracker:
     def _detect(self, view: FrameView) -> tuple[Registration, Evidence, str]:
         """By features: near the last place in the first search, then everywhere.
 
-        Once seen, a frame shows only a part of its features, so that no search takes long.
+        Once the target was seen, most searches see only a part of the frame's features, so that
+        they do not take long; a few see all, for a target that no part is enough to find.
         """
-        sees_all = self._searches == 0 and not self._was_seen
+        is_turn = self._searches % _FULL_SEARCH_EVERY == _FULL_SEARCH_EVERY - 1
+        sees_all = is_turn or not self._was_seen
         features = view.features() if sees_all else view.part_of_features(self._searches)
         self._searches += 1
         template, matching = self.template.features, self._settings.matching

@@ -6,6 +6,7 @@ import time
 
 from streamtrack import geometry
 from streamtrack.budget import FULL_WORK, WorkLevel
+from streamtrack.camera.view_levels import ViewLevels
 from streamtrack.features import FeatureExtractor
 from streamtrack.pyramid import Pyramid
 from streamtrack.types import Features, Frame, Image, Size
@@ -21,6 +22,7 @@ class FrameView:
         self.work = work
         self._extractor = extractor
         self.pyramid = Pyramid(geometry.grey_of(frame.image))
+        self._levels: ViewLevels | None = None
         self._features: Features | None = None
         self._parts: dict[int, Features] = {}
         self.detect_ms = 0.0
@@ -33,6 +35,13 @@ class FrameView:
     @property
     def size_wh(self) -> Size:
         return self.pyramid.size_wh
+
+    @property
+    def levels(self) -> ViewLevels:
+        """The levels at which the frame is aligned with other views."""
+        if self._levels is None:
+            self._levels = ViewLevels(self.grey)
+        return self._levels
 
     def features(self) -> Features:
         """The frame's features, detected at the first call."""

@@ -95,7 +95,7 @@ class AutoCamera:
         self, pose: Matrix, keyframe: int, view: FrameView, tracks: Sequence[Track]
     ) -> None:
         """Has the picture been the same for long enough? From here on the camera stands then."""
-        levels, hidden, rest = ViewLevels(view.grey), _hidden(tracks), self._rest
+        levels, hidden, rest = view.levels, _hidden(tracks), self._rest
         if rest is not None and _is_at_rest(rest.check.of(levels, hidden), rest.check, levels):
             rest.add(pose, view.size_wh)
             if rest.frames >= self._needed:
@@ -111,7 +111,7 @@ class AutoCamera:
 
     def _glance(self, standing: _Standing, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
         """The pose of a camera that stood until now."""
-        levels, hidden = ViewLevels(view.grey), _hidden(tracks)
+        levels, hidden = view.levels, _hidden(tracks)
         if levels.is_flat():
             reason = str(Verdict.TOO_FEW_FEATURES)
             return CameraPose(None, reason=reason, kind=CameraKind.FIXED)

@@ -102,7 +102,7 @@ class MovingCamera:
     def update(self, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
         """The camera's pose in the next frame; targets' quads are left out of account."""
         self._loops.advance()
-        levels = ViewLevels(view.grey)
+        levels = view.levels
         hidden = _outlines(tracks, levels)
         state = self._state
         if state is None:

@@ -36,15 +36,6 @@ class GainEdge:
     weight: float
 
 
-def thumbnail(pixels: Image) -> Image:
-    """BGRW pixels (H, W, 4) at no more than `THUMB_SIDE` px a side."""
-    factor = THUMB_SIDE / max(pixels.shape[:2])
-    if factor >= 1:
-        return pixels
-    size = max(2, round(pixels.shape[1] * factor)), max(2, round(pixels.shape[0] * factor))
-    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
 def ratio(thumb_a: Image, thumb_b: Image, a_from_b: Matrix) -> tuple[LogGain, float] | None:
     """Median of log b - log a (3,) over the overlap and its weight; None if it is too small.
 

@@ -12,7 +12,7 @@ from streamtrack.mosaic.summary import MosaicSummary
 from streamtrack.settings import Settings
 
 if TYPE_CHECKING:
-    from streamtrack.mosaic.types import MosaicView
+    pass
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,10 +71,6 @@ class NoMosaicProgress:
 
     def advance(self, text: str = "") -> None:
         return None
-
-
-ViewWatcher = Callable[["MosaicView"], None]
-"""Called with the mosaic as it grows (a recording shows it)."""
 
 
 def run_mosaic(

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from streamtrack import geometry
-from streamtrack.mosaic.tiles import TILE, Box, TileKey, tile_box
+from streamtrack.mosaic.tiles import TILE, Box, TileKey
 from streamtrack.types import Image, Matrix, Size
 
 _MAX_LEVEL = 8
@@ -85,12 +85,3 @@ def reduced(pixels: Image, level: int) -> Image:
     small[..., :3] = np.minimum(np.rint(bright), 255)
     small[..., 3] = np.where(share > 0, np.maximum(small[..., 3], 1), 0)
     return small
-
-
-def canvas_box(keys: list[TileKey]) -> Box:
-    """The smallest box of whole tiles around the given ones; empty for none."""
-    if not keys:
-        return 0, 0, 0, 0
-    columns, rows = zip(*keys, strict=True)
-    first, last = tile_box((min(columns), min(rows))), tile_box((max(columns), max(rows)))
-    return first[0], first[1], last[2], last[3]

@@ -313,10 +313,6 @@ class Canvas:
     patches: tuple[Patch, ...]
     scale: float
 
-    @property
-    def megapixels(self) -> float:
-        return self.size_wh[0] * self.size_wh[1] / 1e6
-
 
 def natural_size(views: Mapping[int, View]) -> tuple[float, float]:
     """Width and height of the canvas at scale 1; infinite if a picture reaches the horizon."""

@@ -240,35 +240,67 @@ def http_stall(folder: Path) -> Row:
 # --- outputs and ends ---------------------------------------------------------------------------
 
 
-def viewer_fault(name: str, number: signal.Signals, hold_s: float) -> None:
+Viewer = subprocess.Popen[bytes]
+
+
+@contextmanager
+def a_viewer() -> Iterator[Viewer]:
+    """A program that reads all that the live view has to show."""
+    command = [str(viewer_executable()), f"rerun+http://127.0.0.1:{LIVE_PORT}/proxy"]
+    with subprocess.Popen(
+        [*command, "--save", os.devnull], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as viewer:
+        try:
+            yield viewer
+        finally:
+            viewer.kill()
+
+
+def viewer_fault(name: str, act: Callable[[Viewer], object], hold_s: float) -> None:
+    @fault(name)
     def measure(folder: Path) -> Row:
-        record, live = str(folder / "run.rrd"), str(LIVE_PORT)
-        with camera_run(folder, record=record, live=live) as (_, run):
-            run.settle(30)
-            command = [str(viewer_executable()), f"rerun+http://127.0.0.1:{LIVE_PORT}/proxy"]
-            viewer = subprocess.Popen(
-                [*command, "--save", os.devnull],
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )
-            try:
-                row = watched(run, lambda: viewer.send_signal(number), lambda: None, hold_s)
-            finally:
-                viewer.kill()
-                viewer.wait()
-            slow = max(line["ms"] for line in run.of("slow"))
-            run.stop()
-            end = run.of("end")[-1]
-        row.noticed_s = row.recovered_s = None
-        row.not_seen = f"{end['dropped']} dropped"
-        row.remark = f"longest call of the live view {slow:.1f} ms, age p95 {end['age_p95']:.0f} ms"
-        return row
-
-    FAULTS.append((name, measure))
+        with live_run(folder) as run, a_viewer() as viewer:
+            row = watched(run, lambda: act(viewer), lambda: None, hold_s)
+            return without_effect(run, row)
 
 
-viewer_fault("viewer frozen for 15 s", signal.SIGSTOP, 15.0)
-viewer_fault("viewer killed", signal.SIGKILL, 3.0)
+@contextmanager
+def live_run(folder: Path) -> Iterator[Run]:
+    """A run with a recording and a live view, that is well."""
+    with camera_run(folder, record=str(folder / "run.rrd"), live=str(LIVE_PORT)) as (_, run):
+        run.settle(30)
+        yield run
+
+
+def without_effect(run: Run, row: Row) -> Row:
+    """The row of something that a run should not notice at all."""
+    slow = max(line["ms"] for line in run.of("slow"))
+    run.stop()
+    end = run.of("end")[-1]
+    row.noticed_s = row.recovered_s = None
+    row.not_seen = f"{end['dropped']} dropped"
+    row.remark = f"longest call of the live view {slow:.1f} ms, age p95 {end['age_p95']:.0f} ms"
+    return row
+
+
+def read_little(viewer: Viewer, hold_s: float = 15.0) -> None:
+    """Let it run for a twentieth of the time."""
+    for _ in range(round(hold_s)):
+        viewer.send_signal(signal.SIGSTOP)
+        time.sleep(0.95)
+        viewer.send_signal(signal.SIGCONT)
+        time.sleep(0.05)
+
+
+@fault("live view on, no viewer for 15 s")
+def no_viewer(folder: Path) -> Row:
+    with live_run(folder) as run:
+        return without_effect(run, watched(run, lambda: None, lambda: None, 15.0))
+
+
+viewer_fault("viewer slow: runs for a twentieth of 15 s", read_little, 0.0)
+viewer_fault("viewer frozen for 15 s", lambda viewer: viewer.send_signal(signal.SIGSTOP), 15.0)
+viewer_fault("viewer killed", lambda viewer: viewer.kill(), 3.0)
 
 
 @fault("recording fills the disk's last 8 MB, room again after 20 s")

@@ -1,4 +1,4 @@
-"""One tracking run from source to closed outputs: opens everything, loops, closes everything.
+"""One run over a stream from source to closed outputs: opens everything, loops, closes everything.
 
 Watchers (recording, table, poses, annotated video, summary) see each `Step` and decide nothing.
 Whatever ends the run, what was produced until then is kept and properly closed.
@@ -11,11 +11,11 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 from streamtrack.camera.auto import make_camera
 from streamtrack.camera.moving import CameraEstimator
-from streamtrack.errors import SourceError, StreamtrackError, UsageError
+from streamtrack.errors import OutputError, SourceError, StreamtrackError, UsageError
 from streamtrack.mosaic.picture_files import check_picture_path
 from streamtrack.pipeline import track
 from streamtrack.results import check_tracks_path
@@ -23,10 +23,11 @@ from streamtrack.service import ServiceNotifier
 from streamtrack.settings import Settings
 from streamtrack.sources import open_source
 from streamtrack.sources.base import FrameSource
+from streamtrack.sources.live_status import LiveStatus
 from streamtrack.summary import Summary, SummaryBuilder
 from streamtrack.targets import TargetSpec, given_targets
-from streamtrack.types import SourceInfo, Step
-from streamtrack.watching import Outputs, Watchers, live_source, open_watchers
+from streamtrack.types import Skipped, SourceInfo, Step
+from streamtrack.watching import Outputs, RunSummary, Watchers, live_source, open_watchers
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,34 +44,76 @@ class TrackJob:
 
 
 class Progress(Protocol):
-    """Told of the run's progress, so that a person can be."""
+    """Told of the run's progress, so that a person can be.
+
+    ``writing`` is called now and then while outputs are completed after the last frame.
+    """
 
     def begin(self, info: SourceInfo, frames: int | None) -> None: ...
 
     def advance(self, step: Step) -> None: ...
 
+    def writing(self, text: str) -> None: ...
+
+
+SummaryT = TypeVar("SummaryT", bound=RunSummary)
+SummaryT_co = TypeVar("SummaryT_co", bound=RunSummary, covariant=True)
+
+
+class Report(Protocol[SummaryT_co]):
+    """Takes in every step and makes the summary of them."""
+
+    @property
+    def frames(self) -> int: ...
+
+    def add(self, step: Step) -> None:
+        """Take in a step, once all watchers have seen it."""
+
+    def build(
+        self,
+        skipped: Sequence[Skipped],
+        corrupt_packets: int,
+        ended: str,
+        live: LiveStatus | None = None,
+    ) -> SummaryT_co: ...
+
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class Outcome(Generic[SummaryT]):
     """What came of a run: its summary, and what went wrong once frames were coming, if anything."""
 
-    summary: Summary
+    summary: SummaryT
     error: StreamtrackError | None
 
 
-def run_track(job: TrackJob, progress: Progress, should_stop: Callable[[], bool]) -> Outcome:
+def run_track(
+    job: TrackJob, progress: Progress, should_stop: Callable[[], bool]
+) -> Outcome[Summary]:
     """Run the job; all outputs are closed when it returns, whatever ended it.
 
     Raises StreamtrackError if it cannot even start, or an output cannot be closed.
     """
+
+    def begin_report(source: FrameSource, _camera: object, _watchers: object) -> SummaryBuilder:
+        return SummaryBuilder(source.info, job.settings)
+
+    return run(job, begin_report, progress, should_stop)
+
+
+def run(
+    job: TrackJob,
+    begin_report: Callable[[FrameSource, CameraEstimator, Watchers], Report[SummaryT]],
+    progress: Progress,
+    should_stop: Callable[[], bool],
+) -> Outcome[SummaryT]:
+    """What `run_track` does, with a summary of the caller's choice."""
     _check_outputs(job)
     service = ServiceNotifier()
-    watchers: Watchers | None = None
+    watchers = Watchers()
 
     def is_over() -> bool:  # asked all the time, while a live source waits too
-        if watchers is not None:
-            watchers.wait()
-        service.alive("" if watchers is None or not service.is_used else watchers.status())
+        watchers.wait()
+        service.alive(watchers.status() if service.is_used else "")
         return should_stop()
 
     with ExitStack() as stack:
@@ -82,26 +125,26 @@ def run_track(job: TrackJob, progress: Progress, should_stop: Callable[[], bool]
                 should_stop=is_over,
             )
         )
-        builder = SummaryBuilder(source.info, job.settings)
         camera = make_camera(job.settings, is_live=source.info.is_live)
         if camera.graph is not None:
             stack.callback(camera.graph.close)
         stack.callback(camera.close)
+        report = begin_report(source, camera, watchers)
         steps = stack.enter_context(closing(_steps(job, source, camera)))
         # A target that does not fit the first frame is refused before any output is touched.
         first = next(steps, None)
         if first is None:
             raise SourceError(f"{source.info.name}: no frame could be read")
         views = {target.name: target.picture for target in given_targets(job.targets)}
-        watchers = open_watchers(job.outputs, source, job.settings, views, camera, stack)
+        open_watchers(watchers, job.outputs, source, job.settings, views, camera, stack)
         progress.begin(source.info, _expected_frames(job, source.info))
-        service.ready(f"tracking {source.info.name}")
+        service.ready(f"following {source.info.name}")
         error: StreamtrackError | None = None
         ended = ""
         try:
             for step in chain([first], steps):
                 watchers.watch(step)
-                builder.add(step)
+                report.add(step)
                 progress.advance(step)
                 if is_over():
                     ended = f"interrupted after frame {step.frame.index}"
@@ -111,11 +154,14 @@ def run_track(job: TrackJob, progress: Progress, should_stop: Callable[[], bool]
         except StreamtrackError as raised:
             error, ended = raised, str(raised)
         service.stopping()
+        camera.close()  # from here on the poses are final
+        failure = watchers.complete(progress.writing)
+        error = error or failure
         live = live_source(source)
-        summary = builder.build(
+        summary = report.build(
             source.skipped,
             source.corrupt_packets,
-            ended or _natural_end(job, source, builder.frames, should_stop()),
+            ended or _natural_end(job, source, report.frames, should_stop()),
             None if live is None else live.status(),
         )
         failure = watchers.finish(summary)
@@ -132,13 +178,16 @@ def _check_outputs(job: TrackJob) -> None:
         raise UsageError(f"recording {outputs.record}: give it the ending .rrd")
     if outputs.mosaic is not None:
         check_picture_path(outputs.mosaic)
+    for at_the_end in (outputs.mosaic, outputs.summary):
+        if at_the_end is not None and at_the_end.is_dir():
+            raise OutputError(f"cannot write {at_the_end}: this is a folder; name a file in it")
     sources = [job.source] if isinstance(job.source, str) else job.source
     taken = {Path(source).resolve(): f"the source {source}" for source in sources}
     for name in ("record", "tracks", "poses", "video", "summary", "mosaic", "stabilized"):
-        path = getattr(outputs, name)
+        path: Path | None = getattr(outputs, name)
         if path is None:
             continue
-        if path.resolve() in taken and path.name and not _is_device(path):
+        if path.resolve() in taken and not _is_device(path):
             raise UsageError(f"{path} would replace {taken[path.resolve()]}: name another file")
         taken[path.resolve()] = f"the {name} output"
 

@@ -6,10 +6,12 @@ Missing folders are made; what goes wrong is an `OutputError` of one line.
 from __future__ import annotations
 
 import contextlib
+import csv
 import errno
 import io
 import os
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -65,6 +67,21 @@ def write_file(path: Path, data: bytes) -> None:
             part.unlink(missing_ok=True)
     except OSError as error:
         raise output_error(path, error) from None
+
+
+def encodable(text: str) -> str:
+    """The text without lone surrogates (undecodable bytes of file names), which no format holds."""
+    return text.encode("utf-8", "replace").decode("utf-8")
+
+
+def csv_line(cells: Iterable[str]) -> str:
+    r"""One line of CSV ending in ``\n``, line breaks within cells quoted.
+
+    The csv module of Python < 3.13 quotes only the breaks of its own line ending, hence the detour.
+    """
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\r\n").writerow(cells)
+    return buffer.getvalue().removesuffix("\r\n") + "\n"
 
 
 class Closing(ABC):

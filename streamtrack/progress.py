@@ -36,6 +36,9 @@ class NoProgress:
     def advance(self, step: Step) -> None:
         return None
 
+    def writing(self, text: str) -> None:
+        return None
+
 
 class ProgressBar:
     """A bar with frames, frames a second, time left and the targets' states, on a terminal."""
@@ -77,6 +80,10 @@ class ProgressBar:
         fps = self._done / max(time.monotonic() - self._began, 1e-6)
         self._bar.update(self._task, advance=1, fps=f"{fps:.1f} fps", states=_states(step))
 
+    def writing(self, text: str) -> None:
+        assert self._task is not None
+        self._bar.update(self._task, states=f"writing the mosaic {text}")
+
 
 class ProgressLines:
     """A plain line every few seconds, for logs and pipes."""
@@ -115,6 +122,12 @@ class ProgressLines:
             markup=False,
             soft_wrap=True,
         )
+
+    def writing(self, text: str) -> None:
+        now = time.monotonic()
+        if now - self._last >= _LINE_EVERY_S:
+            self._last = now
+            self._console.print(f"writing the mosaic {text}", highlight=False, markup=False)
 
 
 def _states(step: Step) -> str:

@@ -1,6 +1,6 @@
 """Writers of results as files: they watch the Steps go by and never decide anything.
 
-    CSV, JSON Lines, MOT text, poses    a record is on its way to the disk when `write` returns, so
+    CSV, JSON Lines, MOT text    a record is on its way to the disk when `write` returns, so
                                         a killed process loses nothing; a record that a full disk
                                         cut in half is taken back
     Parquet                             row groups of 65 536 rows; readable only once closed
@@ -13,11 +13,10 @@ known before the first frame. What goes wrong is an `OutputError` of one line.
 from __future__ import annotations
 
 import contextlib
-import csv
 import io
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -27,8 +26,15 @@ import numpy as np
 
 from streamtrack.errors import UsageError
 from streamtrack.geometry import bounding_box
-from streamtrack.outputs import Closing, RecordFile, open_output, output_error
-from streamtrack.types import Matrix, Skipped, Step, Track
+from streamtrack.outputs import (
+    Closing,
+    RecordFile,
+    csv_line,
+    encodable,
+    open_output,
+    output_error,
+)
+from streamtrack.types import Step, Track
 
 _BATCH_ROWS = 1024
 _GROUP_BATCHES = 64
@@ -77,10 +83,6 @@ class TrackRow(NamedTuple):
 GROUND_COLUMNS = ("ground_x", "ground_y", "speed_units_s")
 TRACK_COLUMNS = TrackRow._fields[: -len(GROUND_COLUMNS)]
 WORLD_COLUMNS = tuple(name for name in TRACK_COLUMNS if name.startswith("world_"))
-POSE_COLUMNS = (
-    *("frame", "name", "time_s", "status", "reason"),
-    *(f"h{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)),
-)
 _DECIMALS = (
     dict.fromkeys((*TRACK_COLUMNS[4:12], *WORLD_COLUMNS, "speed_px_s"), 3)
     | dict.fromkeys(GROUND_COLUMNS, 4)
@@ -98,7 +100,7 @@ def _track_row(step: Step, track: Track) -> TrackRow:
     cells: list[str | float | None] = [
         step.frame.index,
         _finite(step.frame.time_s),
-        _encodable(track.name),
+        encodable(track.name),
         track.state.value,
         *([None] * 8 if quad is None else quad),
         None if quad is None or track.model is None else track.model.value,
@@ -132,21 +134,6 @@ def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _encodable(text: str) -> str:
-    """The text without lone surrogates (undecodable bytes of file names), which no format holds."""
-    return text.encode("utf-8", "replace").decode("utf-8")
-
-
-def _csv_line(cells: Iterable[str]) -> str:
-    r"""One line of CSV ending in ``\n``, line breaks within cells quoted.
-
-    The csv module of Python < 3.13 quotes only the breaks of its own line ending, hence the detour.
-    """
-    buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\r\n").writerow(cells)
-    return buffer.getvalue().removesuffix("\r\n") + "\n"
-
-
 def _csv_cell(column: str, value: str | float | None) -> str:
     if value is None:
         return ""
@@ -155,7 +142,7 @@ def _csv_cell(column: str, value: str | float | None) -> str:
 
 def _csv_lines(step: Step, columns: Sequence[str]) -> str:
     return "".join(
-        _csv_line(_csv_cell(column, getattr(row, column)) for column in columns)
+        csv_line(_csv_cell(column, getattr(row, column)) for column in columns)
         for row in track_rows(step)
     )
 
@@ -306,7 +293,7 @@ def _parquet_schema(columns: Sequence[str]) -> Any:
 
 _OPENERS: dict[str, Callable[[Path, Sequence[str]], TracksWriter]] = {
     ".csv": lambda path, columns: _TextTracksWriter(
-        path, _csv_line(columns), partial(_csv_lines, columns=columns)
+        path, csv_line(columns), partial(_csv_lines, columns=columns)
     ),
     ".jsonl": lambda path, columns: _TextTracksWriter(
         path, "", partial(_json_lines, columns=columns)
@@ -333,41 +320,3 @@ def open_tracks_writer(path: Path, columns: Sequence[str] = TRACK_COLUMNS) -> Tr
     """
     check_tracks_path(path)
     return _OPENERS[path.suffix.lower()](path, columns)
-
-
-class PosesWriter(RecordFile):
-    """CSV of camera poses: ``world_from_frame`` row by row, in full precision.
-
-    Status is ``used``, or ``skipped`` with a reason and no matrix where the pose is not known.
-    """
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, _csv_line(POSE_COLUMNS))
-
-    def write(self, step: Step) -> None:
-        """Add the pose of one frame. Raises OutputError."""
-        frame, camera = step.frame, step.camera
-        self.write_pose(
-            frame.index, frame.name, frame.time_s, camera.world_from_frame, camera.reason
-        )
-
-    def write_pose(
-        self, index: int, name: str, time_s: float, world_from_frame: Matrix | None, reason: str
-    ) -> None:
-        """Add a frame's pose, or why it has none. Raises OutputError."""
-        time_cell = _csv_cell("time_s", _finite(time_s))
-        if world_from_frame is None:
-            self._add(index, name, time_cell, "skipped", reason, [""] * 9)
-        else:
-            elements = [str(float(value)) for value in world_from_frame.ravel()]
-            self._add(index, name, time_cell, "used", "", elements)
-
-    def write_skipped(self, skipped: Skipped) -> None:
-        """Add a picture that the source left out; its time is not known. Raises OutputError."""
-        self._add(skipped.index, skipped.name, "", "skipped", skipped.reason, [""] * 9)
-
-    def _add(
-        self, index: int, name: str, time_s: str, status: str, reason: str, elements: list[str]
-    ) -> None:
-        cells = (str(index), _encodable(name), time_s, status, _encodable(reason), *elements)
-        self.append(_csv_line(cells))

@@ -34,8 +34,6 @@ from streamtrack.sources.live_status import LiveStatus
 from streamtrack.summary_text import cell, markdown, number, write_json
 from streamtrack.types import AUTO_STAGE, Size, Skipped, SourceInfo, Step, Track, TrackState
 
-_LIVE_COUNTS = ("captured", "dropped", "thinned", "lost", "damaged", "reconnects", "stalls")
-
 
 @dataclass(frozen=True, slots=True)
 class TargetSummary:
@@ -207,7 +205,7 @@ class Summary:
                 for item in self.skipped
             ],
             "corrupt_packets": self.corrupt_packets,
-            "live": self._live_json(),
+            "live": None if self.live is None else self.live.to_json(),
             "ended": self.ended,
         }
 
@@ -239,27 +237,9 @@ class Summary:
             ("Frames a second", f"{number(self.fps, 1)}, reading and writing included"),
             ("Peak memory", f"{self.peak_rss_mb:.0f} MB"),
             ("Corrupt packets", str(self.corrupt_packets)),
-            *self._live_rows(),
+            *(() if self.live is None else self.live.rows()),
             ("Skipped pictures", str(len(self.skipped))),
             ("Ended", self.ended),
-        ]
-
-    def _live_json(self) -> dict[str, Any] | None:
-        if self.live is None:
-            return None
-        counts = {name: getattr(self.live, name) for name in _LIVE_COUNTS}
-        age_ms = {"p50": self.live.age_ms_p50, "p95": self.live.age_ms_p95}
-        return {**counts, "away_s": self.live.away_s, "frame_age_ms": age_ms}
-
-    def _live_rows(self) -> list[tuple[str, str]]:
-        live = self.live
-        if live is None:
-            return []
-        counts = ", ".join(f"{name} {getattr(live, name)}" for name in _LIVE_COUNTS)
-        p50, p95 = number(live.age_ms_p50, 0), number(live.age_ms_p95, 0)
-        return [
-            ("Live pictures", f"{counts}, away {live.away_s:.1f} s"),
-            ("Age of a frame when done", f"median {p50} ms, p95 {p95} ms"),
         ]
 
     def _budget_json(self) -> dict[str, Any] | None:

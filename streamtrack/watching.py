@@ -1,7 +1,8 @@
 """Who looks at a run's Steps: tables, pictures, recording, live view, mosaic.
 
-Watchers watch and decide nothing. Each is a function of a `Step`; a finisher is called once with
-the summary when the last one has gone by.
+Watchers watch and decide nothing. Each is a function of a `Step`. When the last one has gone by
+and all poses are final, a completer is called once with what to tell of its progress, and then a
+finisher with the summary.
 """
 
 from __future__ import annotations
@@ -13,19 +14,20 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 from streamtrack.camera.moving import CameraEstimator
 from streamtrack.camera.notes import CameraNotes
 from streamtrack.errors import OutputError, StreamtrackError
-from streamtrack.results import GROUND_COLUMNS, TRACK_COLUMNS, PosesWriter, open_tracks_writer
+from streamtrack.poses import FinalPoses, PosesWriter
+from streamtrack.results import GROUND_COLUMNS, TRACK_COLUMNS, open_tracks_writer
 from streamtrack.settings import Settings, WorldSettings
 from streamtrack.sources.base import FrameSource
-from streamtrack.summary import Summary
 from streamtrack.types import Image, SourceInfo, Step
 from streamtrack.working_size import graph_in_full_size
 
 if TYPE_CHECKING:
+    from streamtrack.mosaic.export import Exported
     from streamtrack.mosaic.stream import PoseGraph, StreamMosaic
     from streamtrack.recording.live_server import LiveAddress
     from streamtrack.recording.live_view import LiveView
@@ -33,7 +35,18 @@ if TYPE_CHECKING:
     from streamtrack.sources.live import LiveSource
 
 Watcher: TypeAlias = Callable[[Step], None]
-Finisher: TypeAlias = Callable[[Summary], None]
+Completer: TypeAlias = Callable[[Callable[[str], None]], None]
+
+
+class RunSummary(Protocol):
+    """What a run was and did, for people and programs."""
+
+    def to_markdown(self) -> str: ...
+
+    def write_json(self, path: Path) -> None: ...
+
+
+Finisher: TypeAlias = Callable[[RunSummary], None]
 
 _FALLBACK_RATE_HZ = 30.0
 _COUNTS_EVERY_S = 1.0
@@ -44,7 +57,10 @@ _log = logging.getLogger("streamtrack.run")
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """Where the results go; None where they are not wanted."""
+    """Where the results go; None where they are not wanted.
+
+    ``shows_mosaic`` has a mosaic grown for recording and live view though no file is wanted.
+    """
 
     record: Path | None = None
     tracks: Path | None = None
@@ -54,15 +70,25 @@ class Outputs:
     mosaic: Path | None = None
     live: LiveAddress | None = None
     stabilized: Path | None = None
+    shows_mosaic: bool = False
+
+    @property
+    def has_mosaic(self) -> bool:
+        return self.shows_mosaic or self.mosaic is not None
 
 
 @dataclass(slots=True)
 class Watchers:
-    """All of one run's; what an output needs at the end is in the exit stack it was opened with."""
+    """All of one run's; what an output needs at the end is in the exit stack it was opened with.
+
+    None of them watches before `open_watchers`.
+    """
 
     watchers: list[Watcher] = field(default_factory=list)
+    completers: list[Completer] = field(default_factory=list)
     finishers: list[Finisher] = field(default_factory=list)
     recorder: Recorder | None = None
+    mosaic: MosaicWatcher | None = None
     live: LiveWatcher | None = None
 
     def watch(self, step: Step) -> None:
@@ -78,8 +104,18 @@ class Watchers:
         """How a live source does, in a few words; empty for others."""
         return "" if self.live is None else str(self.live)
 
-    def finish(self, summary: Summary) -> StreamtrackError | None:
-        """Complete all outputs; returns what went wrong with one that did not stop the run."""
+    def complete(self, advance: Callable[[str], None]) -> StreamtrackError | None:
+        """Do what waited for the final poses; returns the first thing that went wrong."""
+        failure: StreamtrackError | None = None
+        for completer in self.completers:
+            try:
+                completer(advance)
+            except StreamtrackError as error:
+                failure = failure or error
+        return failure
+
+    def finish(self, summary: RunSummary) -> StreamtrackError | None:
+        """Close all outputs; returns what went wrong with one that did not stop the run."""
         self.wait()
         failure: StreamtrackError | None = None
         for finisher in self.finishers:
@@ -97,18 +133,19 @@ class Watchers:
 
 
 def open_watchers(
+    result: Watchers,
     outputs: Outputs,
     source: FrameSource,
     settings: Settings,
     views: Mapping[str, Image | None],
     camera: CameraEstimator,
     stack: ExitStack,
-) -> Watchers:
+) -> None:
     """Open every output that is wanted; ``views`` holds each target's template picture or None.
 
     Raises OutputError.
     """
-    info, result = source.info, Watchers()
+    info = source.info
     if outputs.summary is not None:
         result.finishers.append(_summary_finisher(outputs.summary))
     if outputs.tracks is not None:
@@ -117,10 +154,6 @@ def open_watchers(
             columns += GROUND_COLUMNS
         tracks = stack.enter_context(open_tracks_writer(outputs.tracks, columns))
         result.watchers.append(tracks.write)
-    if outputs.poses is not None:
-        poses = stack.enter_context(PosesWriter(outputs.poses))
-        result.watchers.append(poses.write)
-        result.finishers.append(_skipped_finisher(poses))
     if outputs.video is not None:
         result.watchers.append(_video_watcher(outputs.video, info, stack))
     graph = graph_in_full_size(camera.graph, info.size_wh, settings.max_width)
@@ -129,18 +162,21 @@ def open_watchers(
     displays = _open_displays(outputs, info, settings, views, stack, result)
     result.watchers.extend(display.log for display in displays)
     result.watchers.append(_camera_watcher(settings))
-    if outputs.mosaic is not None:
+    if outputs.has_mosaic:
         from streamtrack.mosaic.stream import StreamMosaic
 
         mosaic = stack.enter_context(StreamMosaic(settings.mosaic, graph))
-        _add_mosaic(outputs.mosaic, mosaic, camera, displays, result)
+        result.mosaic = MosaicWatcher(outputs.mosaic, mosaic, displays)
+        result.watchers.append(result.mosaic.watch)
+        result.completers.append(result.mosaic.finish)
+    if outputs.poses is not None:
+        _add_poses(outputs.poses, source, graph, stack, result)
     live = live_source(source)
     if live is not None:
         result.live = LiveWatcher(live, displays)
         result.watchers.append(result.live.watch)
     # The live view first: it ends by itself while the recording is closed.
     result.finishers.extend(_closer(display) for display in reversed(displays))
-    return result
 
 
 def _camera_watcher(settings: Settings) -> Watcher:
@@ -176,7 +212,7 @@ def _open_displays(
     """The recording and the live view: both take the same."""
     displays: list[Recorder | LiveView] = []
     pictures = {name: picture for name, picture in views.items() if picture is not None}
-    about = (info, settings, list(views), pictures, outputs.mosaic is not None)
+    about = (info, settings, list(views), pictures, outputs.has_mosaic)
     if outputs.record is not None:
         from streamtrack.recording.recorder import Recorder
 
@@ -196,39 +232,49 @@ def _closer(display: Recorder | LiveView) -> Finisher:
     return lambda summary: close(summary.to_markdown())
 
 
-def _add_mosaic(
-    path: Path,
-    mosaic: StreamMosaic,
-    camera: CameraEstimator,
-    displays: Sequence[Recorder | LiveView],
-    result: Watchers,
-) -> None:
-    """Grow a mosaic with the run and write it at the end; targets are left out of it."""
-    last: list[tuple[int, float]] = []
+class MosaicWatcher:
+    """Grows a mosaic with the run, and writes it if a path is given; targets are left out of it.
 
-    def watch(step: Step) -> None:
+    ``reason`` says why the last frame has no place in it, ``paint_ms`` what that frame cost, and
+    ``exported`` what was written.
+    """
+
+    def __init__(
+        self,
+        path: Path | None,
+        mosaic: StreamMosaic,
+        displays: Sequence[Recorder | LiveView],
+    ) -> None:
+        self.mosaic = mosaic
+        self.reason = ""
+        self.paint_ms = 0.0
+        self.exported: Exported | None = None
+        self._path = path
+        self._displays = displays
+        self._last: tuple[int, float] | None = None
+
+    def watch(self, step: Step) -> None:
         frame, pose = step.frame, step.camera
-        reason = mosaic.add(frame, pose, step.tracks)
-        last[:] = [(frame.index, frame.time_s)]
+        began = time.perf_counter()
+        reason = self.reason = self.mosaic.add(frame, pose, step.tracks)
+        self.paint_ms = (time.perf_counter() - began) * 1e3
+        self._last = frame.index, frame.time_s
         world_from_frame = None if reason else pose.world_from_frame
         state = "placed" if not reason else "lost" if pose.world_from_frame is None else "refused"
-        found = {"inliers": float(pose.inliers), "rmse_px": pose.rmse_px}
+        found = {"inliers": float(pose.inliers), "rmse_px": pose.rmse_px, "paint_ms": self.paint_ms}
         metrics = {name: value for name, value in found.items() if math.isfinite(value)}
-        for display in displays:
+        for display in self._displays:
             place = (frame.index, frame.time_s, frame.size_wh, world_from_frame)
             display.log_mosaic_frame(*place, state, reason, metrics)
             if display.is_mosaic_due(frame.time_s):
-                display.log_mosaic(mosaic.view(), frame.index, frame.time_s)
+                display.log_mosaic(self.mosaic.view(), frame.index, frame.time_s)
 
-    def finish(_summary: Summary) -> None:
-        camera.close()  # from here on the poses are final
-        mosaic.finish(path)
-        for display in displays:
-            for index, time_s in last:
-                display.log_mosaic(mosaic.view(), index, time_s)
-
-    result.watchers.append(watch)
-    result.finishers.append(finish)
+    def finish(self, advance: Callable[[str], None]) -> None:
+        """Take over the final poses and write the picture. Raises OutputError."""
+        self.exported = self.mosaic.finish(self._path, advance)
+        for display in self._displays:
+            if self._last is not None:
+                display.log_mosaic(self.mosaic.view(), *self._last)
 
 
 class LiveWatcher:
@@ -273,12 +319,29 @@ def _summary_finisher(path: Path) -> Finisher:
     return lambda summary: summary.write_json(path)
 
 
-def _skipped_finisher(poses: PosesWriter) -> Finisher:
-    def finish(summary: Summary) -> None:
-        for skipped in summary.skipped:
+def _add_poses(
+    path: Path, source: FrameSource, graph: PoseGraph | None, stack: ExitStack, result: Watchers
+) -> None:
+    """Write poses as they come; of a file, where they may still change, all of them at the end."""
+    poses = stack.enter_context(PosesWriter(path))
+    final = None if graph is None or source.info.is_live else FinalPoses(poses, graph)
+    add = poses.write_pose if final is None else final.add
+
+    def watch(step: Step) -> None:
+        frame, pose = step.frame, step.camera
+        reason = pose.reason if result.mosaic is None else result.mosaic.reason
+        add(
+            frame.index, frame.name, frame.time_s, None if reason else pose.world_from_frame, reason
+        )
+
+    def complete(_advance: object) -> None:
+        if final is not None:
+            final.write()
+        for skipped in source.skipped:
             poses.write_skipped(skipped)
 
-    return finish
+    result.watchers.append(watch)
+    result.completers.append(complete)
 
 
 def _video_watcher(path: Path, info: SourceInfo, stack: ExitStack) -> Watcher:
@@ -315,13 +378,11 @@ def _add_stabilized(
         for shown in view.add(step):
             writer.write(shown.image, shown.time_s)
 
-    def finish(summary: Summary) -> None:
+    def finish(_summary: RunSummary) -> None:
         for shown in view.finish():
             writer.write(shown.image, shown.time_s)
         if view.unplaced:
-            _log.warning(
-                "%d of %d frames could not be placed in %s", view.unplaced, summary.frames, path
-            )
+            _log.warning("%d frames could not be placed in %s", view.unplaced, path)
 
     result.watchers.append(watch)
     result.finishers.append(finish)

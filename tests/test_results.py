@@ -14,16 +14,15 @@ import pytest
 
 from streamtrack import results
 from streamtrack.errors import OutputError, UsageError
-from streamtrack.geometry import box_quad, translation
+from streamtrack.geometry import box_quad
 from streamtrack.outputs import output_error, write_file
-from streamtrack.results import PosesWriter, open_tracks_writer
+from streamtrack.results import open_tracks_writer
 from streamtrack.types import (
     CameraPose,
     Evidence,
     Frame,
     Model,
     Points,
-    Skipped,
     Step,
     Track,
     TrackState,
@@ -276,34 +275,6 @@ def test_output_errors_say_what_to_do(number: int, advice: str) -> None:
     assert message.startswith("cannot write out/t.csv: ")
     assert advice in message
     assert "\n" not in message
-
-
-def test_poses_read_back_exactly(tmp_path: Path) -> None:
-    pose = translation(0.1, -1e6 / 3)
-    pose[2, :2] = 1.23456789e-7, -3e-12
-    path = tmp_path / "poses.csv"
-    with PosesWriter(path) as writer:
-        writer.write(_step(0, camera=CameraPose(pose), name='a,"b".png'))
-        writer.write(_step(1, camera=CameraPose(None, reason="too few matches")))
-        writer.write_skipped(Skipped(2, "c.png", "not a picture, or broken"))
-    rows = _read_csv(path)
-    assert list(rows[0])[:7] == ["frame", "name", "time_s", "status", "reason", "h11", "h12"]
-    assert list(rows[0])[-1] == "h33"
-    read = np.array([float(rows[0][f"h{i}{j}"]) for i in (1, 2, 3) for j in (1, 2, 3)])
-    np.testing.assert_array_equal(read.reshape(3, 3), pose)
-    assert [(row["frame"], row["status"], row["reason"]) for row in rows] == [
-        ("0", "used", ""),
-        ("1", "skipped", "too few matches"),
-        ("2", "skipped", "not a picture, or broken"),
-    ]
-    assert rows[0]["name"] == 'a,"b".png'
-    assert [row["time_s"] for row in rows] == ["0.000000", "0.033333", ""]
-    assert rows[1]["h11"] == rows[2]["h33"] == ""
-
-
-def test_poses_on_a_full_disk(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="no space left"):
-        PosesWriter(_full(tmp_path, ".csv"))
 
 
 def test_whole_files_are_replaced_or_left_alone(

@@ -17,8 +17,8 @@ import pytest
 from conftest import Clip, FrameList, MakePicture
 
 from streamtrack import geometry
+from streamtrack import job as jobs
 from streamtrack.errors import OutputError, SourceError, UsageError
-from streamtrack.mosaic import stream_job
 from streamtrack.mosaic.job import MosaicJob, MosaicOutcome, MosaicOutputs, NoMosaicProgress
 from streamtrack.mosaic.stream import StreamMosaic
 from streamtrack.mosaic.stream_job import run_stream_mosaic
@@ -434,7 +434,7 @@ def test_frames_are_chosen(tmp_path: Path) -> None:
 def test_a_wish_to_stop_writes_the_mosaic_so_far(tmp_path: Path) -> None:
     calls = iter([False] * 4 + [True])
     outcome = run(job(tmp_path), lambda: next(calls))
-    assert str(outcome.error) == "interrupted after frame 4: the mosaic up to there is written"
+    assert str(outcome.error) == "interrupted after frame 4: everything up to there is written"
     assert len(poses_of(tmp_path)) == 5
     assert read(tmp_path / "m.png").size > 0
     assert json.loads((tmp_path / "summary.json").read_text())["ended"].startswith("interrupted")
@@ -449,7 +449,7 @@ class Breaking(FrameList):
 
 
 def given_source(monkeypatch: pytest.MonkeyPatch, source: FrameList) -> None:
-    monkeypatch.setattr(stream_job, "open_source", lambda *_, **__: source)
+    monkeypatch.setattr(jobs, "open_source", lambda *_, **__: source)
 
 
 def test_what_a_broken_source_gave_is_kept(
@@ -493,7 +493,7 @@ def test_a_cut_is_left_out_and_told(
     ("outputs", "values", "said"),
     [
         ({"image": "m.gif"}, {}, "no picture format"),
-        ({"image": "m.png", "summary": "m.png"}, {}, "would replace the image output"),
+        ({"image": "m.png", "summary": "m.png"}, {}, "would replace the summary output"),
         ({"record": "m.png"}, {}, r"ending \.rrd"),
         ({}, {"truth": Path("H.txt")}, "--truth is for two pictures"),
     ],
@@ -513,3 +513,10 @@ def test_an_output_that_cannot_be_written_spoils_no_other(tmp_path: Path) -> Non
     outcome = run(job(tmp_path, outputs=outputs))
     assert "file stands where its folder should be" in str(outcome.error)
     assert len(poses_of(tmp_path)) == 14
+
+
+def test_a_camera_that_is_not_there_is_waited_for_until_the_wish_to_stop(tmp_path: Path) -> None:
+    asked = iter(range(10**6))
+    with pytest.raises(SourceError, match="interrupted before the first picture"):
+        run(job(tmp_path, "rtsp://127.0.0.1:1/nothing"), lambda: next(asked) >= 20)
+    assert not list(tmp_path.iterdir())

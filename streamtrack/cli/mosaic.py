@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,6 +18,7 @@ from streamtrack.cli.plain import plain_summary, stage_progress_for, warnings_on
 from streamtrack.errors import UsageError
 
 if TYPE_CHECKING:
+    from streamtrack.recording.live_server import LiveAddress
     from streamtrack.settings import Settings
 
 
@@ -65,6 +67,21 @@ def mosaic(
         Path | None, typer.Option(help="Recording for the Rerun viewer (.rrd).")
     ] = None,
     no_record: Annotated[bool, typer.Option("--no-record", help="Make no recording.")] = False,
+    live: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[[ADDRESS:]PORT]",
+            help="Show a stream's mosaic as it grows, in a browser or Rerun viewer: at "
+            "127.0.0.1:9876 if no address follows.",
+        ),
+    ] = None,
+    max_fps: Annotated[
+        float | None, typer.Option(help="Leave out pictures of a live source beyond this rate.")
+    ] = None,
+    retries: Annotated[
+        int | None,
+        typer.Option(min=0, help="Openings of a live source in a row; default for ever."),
+    ] = None,
     settings: Annotated[Path | None, typer.Option(help="Settings as TOML; flags win.")] = None,
     start: Annotated[int, typer.Option(min=0, help="First frame or picture, from 0.")] = 0,
     step: Annotated[int, typer.Option(min=1, help="Use every n-th.")] = 1,
@@ -72,7 +89,7 @@ def mosaic(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
 ) -> None:
     """Join pictures, or the frames of a stream, into one picture, and say how well they fit."""
-    if output is None and poses is None and summary is None and record is None:
+    if not any((output, poses, summary, record, live is not None)):
         raise UsageError("nothing would be written: name the mosaic, as in --output mosaic.png")
     if no_record and record is not None:
         raise UsageError("--record and --no-record contradict each other: give one of them")
@@ -87,13 +104,16 @@ def mosaic(
             "max_megapixels": max_megapixels,
             "max_memory_mb": max_memory,
         },
+        {"max_fps": max_fps, "retries": retries},
     )
     from streamtrack.mosaic.job import MosaicJob, MosaicOutputs, run_mosaic
+
+    address = None if live is None else _live_address(live, quiet)
 
     job = MosaicJob(
         tuple(inputs),
         chosen,
-        MosaicOutputs(output, poses, summary, record),
+        MosaicOutputs(output, poses, summary, record, address),
         truth,
         start,
         step,
@@ -117,6 +137,7 @@ def _settings(
     features: tuple[str | None, float | None, str | None],
     model: str | None,
     mosaic_flags: dict[str, str | float | None],
+    live_flags: dict[str, float | int | None],
 ) -> Settings:
     names = ("detector", "threshold", "descriptor")
     return merged_settings(
@@ -125,5 +146,17 @@ def _settings(
             "features": dict(zip(names, features, strict=True)),
             "registration": {"model": model},
             "mosaic": mosaic_flags,
+            "live": live_flags,
         },
     )
+
+
+def _live_address(text: str, quiet: bool) -> LiveAddress:
+    """Where the live view will be; said, as it is of no use unknown."""
+    from streamtrack.recording.live_server import parse_live
+
+    address = parse_live(text)
+    if not quiet:
+        sys.stdout.write(f"Watch it: {address.page_url}\n")
+        sys.stdout.flush()
+    return address

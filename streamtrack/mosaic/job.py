@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from streamtrack.errors import StreamtrackError
+from streamtrack.errors import StreamtrackError, UsageError
 from streamtrack.mosaic.summary import MosaicSummary
 from streamtrack.settings import Settings
 
 if TYPE_CHECKING:
-    pass
+    from streamtrack.recording.live_server import LiveAddress
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +23,7 @@ class MosaicOutputs:
     poses: Path | None = None
     summary: Path | None = None
     record: Path | None = None
+    live: LiveAddress | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +87,8 @@ def run_mosaic(
         from streamtrack.mosaic.stream_job import run_stream_mosaic
 
         return run_stream_mosaic(job, progress, should_stop)
+    if job.outputs.live is not None:
+        raise UsageError("--live shows a stream as it goes, and these are pictures: leave it out")
     from streamtrack.mosaic.pictures import run_picture_mosaic
 
     return run_picture_mosaic(job, progress, should_stop)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -14,12 +11,11 @@ import numpy as np
 from streamtrack.errors import OutputError
 from streamtrack.mosaic.types import Placement
 from streamtrack.outputs import write_file
+from streamtrack.poses import PosesWriter
 from streamtrack.types import Image, Size
 
 _JPEG_QUALITY = 95
 _TRANSPARENT = (".png", ".tif", ".tiff", ".webp")
-_MATRIX_COLUMNS = tuple(f"h{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))
-_POSE_COLUMNS = ("frame", "name", "time_s", "status", "reason", *_MATRIX_COLUMNS)
 
 
 def write_mosaic(path: Path, size_wh: Size, bands: Iterator[Image], count: int) -> str:
@@ -61,15 +57,8 @@ def _on_black(pixels: Image) -> Image:
 
 def write_poses(path: Path, images: Sequence[Placement]) -> None:
     """CSV of ``world_from_frame``, a row a picture, in full precision. Raises OutputError."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_POSE_COLUMNS)
-    writer.writerows(_pose_row(image) for image in images)
-    write_file(path, text.getvalue().encode("utf-8", "replace"))
-
-
-def _pose_row(image: Placement) -> Iterable[str]:
-    matrix = image.world_from_picture
-    elements = [""] * 9 if matrix is None else [str(float(v)) for v in matrix.ravel()]
-    time_s = str(image.time_s) if math.isfinite(image.time_s) else ""
-    return [str(image.index), image.name, time_s, image.status.value, image.reason, *elements]
+    with PosesWriter(path) as writer:
+        for image in images:
+            writer.write_pose(
+                image.index, image.name, image.time_s, image.world_from_picture, image.reason
+            )

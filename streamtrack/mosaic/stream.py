@@ -365,7 +365,8 @@ class StreamMosaic:
         if self._store is None:
             if path is None:
                 return None
-            raise OutputError(f"no frame could be placed: {path} is not written")
+            why = ", ".join(f"{why} {n}" for why, n in self.figures.refused.most_common())
+            raise OutputError(f"no frame could be placed ({why}): {path} is not written")
         self._keep_waiting()
         self._checking = deque(self._store.views.values())
         self._check(len(self._checking), math.inf)

@@ -1,104 +1,26 @@
-"""What became of each frame of a stream, in little memory, and the summary of its mosaic."""
+"""The summary of the mosaic of a stream, gathered while the Steps go by."""
 
 from __future__ import annotations
 
 import time
-from array import array
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 
 from streamtrack import geometry
-from streamtrack.meters import LogHistogram, Mean, peak_rss_mb
+from streamtrack.meters import LogHistogram, peak_rss_mb
 from streamtrack.mosaic.export import Exported
-from streamtrack.mosaic.stream import StreamMosaic
 from streamtrack.mosaic.summary import LinkSummary, MosaicSummary
 from streamtrack.mosaic.types import KeyframeEdge, Link, Placement, Status
 from streamtrack.settings import Settings
 from streamtrack.sources.base import FrameSource
-from streamtrack.types import Frame, Matrix
+from streamtrack.sources.live_status import LiveStatus
+from streamtrack.types import Matrix, Skipped, Step
+from streamtrack.watching import MosaicWatcher, Watchers
 
-
-@dataclass(frozen=True, slots=True)
-class FrameRow:
-    """One frame; ``reason`` is empty if it was placed."""
-
-    index: int
-    name: str
-    time_s: float
-    reason: str
-    features: int
-
-
-class FrameLog:
-    """Every frame's fate at about 24 bytes a frame, so that a day of video is a few megabytes."""
-
-    def __init__(self) -> None:
-        self._indices = array("q")
-        self._times = array("d")
-        self._reasons = array("H")
-        self._features = array("i")
-        self._names: dict[int, str] = {}
-        self._texts: list[str] = [""]
-        self._ms = LogHistogram()
-        self._mean_ms = Mean()
-        self.placed = 0
-
-    def __len__(self) -> int:
-        return len(self._indices)
-
-    def add(self, frame: Frame, reason: str, features: int) -> None:
-        """Note a frame. Only so many different reasons are told apart."""
-        if reason not in self._texts:
-            self._texts.append(reason if len(self._texts) < _MOST_TEXTS else _OTHER)
-        at = self._texts.index(reason) if reason in self._texts else len(self._texts) - 1
-        self._indices.append(frame.index)
-        self._times.append(frame.time_s)
-        self._reasons.append(at)
-        self._features.append(features)
-        if frame.name:
-            self._names[frame.index] = frame.name
-        self.placed += not reason
-
-    def add_time(self, milliseconds: float) -> None:
-        """Note what a frame cost."""
-        self._ms.add(milliseconds)
-        self._mean_ms.add(milliseconds)
-
-    @property
-    def last(self) -> tuple[int, float]:
-        """Index and time of the last frame."""
-        return self._indices[-1], self._times[-1]
-
-    @property
-    def median_ms(self) -> float | None:
-        return self._ms.quantile(0.5)
-
-    @property
-    def p95_ms(self) -> float | None:
-        return self._ms.quantile(0.95)
-
-    def rows(self) -> Iterator[FrameRow]:
-        """All frames in order."""
-        for index, time_s, reason, features in zip(
-            self._indices, self._times, self._reasons, self._features, strict=True
-        ):
-            yield FrameRow(index, self._names.get(index, ""), time_s, self._texts[reason], features)
-
-    def skipped(self) -> dict[str, int]:
-        """Frames that were not placed, by reason, most first."""
-        counts = Counter(self._reasons)
-        named: Counter[str] = Counter()
-        for reason, count in counts.items():
-            if reason:
-                named[self._texts[reason]] += count
-        return dict(named.most_common())
-
-
-_MOST_TEXTS = 1000
+_MOST_REASONS = 1000
 _OTHER = "another reason"
 
 
@@ -121,67 +43,122 @@ class _Graph(Protocol):
     def edges(self) -> Sequence[KeyframeEdge]: ...
 
 
-def summary_of(
-    source: FrameSource,
-    settings: Settings,
-    log: FrameLog,
-    graph: _Graph,
-    mosaic: StreamMosaic,
-    exported: Exported | None,
-    ended: str,
-    began: tuple[float, float],
-) -> MosaicSummary:
-    """The summary of a run; ``began`` is its start on the wall's and on the processor's clock."""
-    links, edges = graph.links, graph.edges
-    names = {index: f"frame {index}" for index in graph.keyframes}
-    skipped = log.skipped()
-    for picture in source.skipped:
-        skipped[picture.reason] = skipped.get(picture.reason, 0) + 1
-    notes = (*mosaic.notes, *(exported.notes if exported is not None else ()))
-    models = Counter(link.model.value for link in links if link.model is not None)
-    agreement = [link.overlap_ncc for link in links if np.isfinite(link.overlap_ncc)]
-    return MosaicSummary(
-        source=source.info.name,
-        settings=settings,
-        images=_placements(log, graph),
-        links=tuple(
-            LinkSummary.of(link, names, is_loop=edge.is_loop)
-            for link, edge in zip(links, edges, strict=False)
-        ),
-        frames_used=log.placed,
-        frames_skipped=skipped,
-        transformation_model=models.most_common(1)[0][0] if models else None,
-        projection="planar" if log.placed else None,
-        reference=next(iter(names.values()), None),
-        canvas_wh=exported.size_wh if exported is not None else None,
-        scale=exported.scale if exported is not None else 1.0,
-        rmse_px=_rmse_px(links, graph),
-        overlap_ncc=float(np.mean(agreement)) if agreement else float("nan"),
-        time_s=time.perf_counter() - began[0],
-        cpu_s=time.process_time() - began[1],
-        peak_rss_mb=peak_rss_mb(),
-        ms_per_frame=log.median_ms,
-        ended=ended,
-        notes=notes,
-        more=_more(log, edges, graph, mosaic, exported),
-    )
+class StreamReport:
+    """What becomes of the frames of a stream, in memory that does not grow with their number."""
 
+    def __init__(
+        self, source: FrameSource, settings: Settings, graph: _Graph, watchers: Watchers
+    ) -> None:
+        self._began = time.perf_counter(), time.process_time()
+        self._source = source
+        self._settings = settings
+        self._graph = graph
+        self._watchers = watchers
+        self._reasons: Counter[str] = Counter()
+        self._features: dict[int, int] = {}
+        self._ms = LogHistogram()
+        self.frames = 0
 
-def _placements(log: FrameLog, graph: _Graph) -> tuple[Placement, ...]:
-    """The keyframes, with the features that their frames had."""
-    keyframes = graph.keyframes
-    features = {row.index: row for row in log.rows() if row.index in keyframes}
-    return tuple(
-        Placement(
-            index=index,
-            name=f"frame {index}",
-            features=features[index].features if index in features else 0,
-            status=Status.USED,
-            world_from_picture=keyframe.world_from_keyframe,
-            time_s=keyframe.time_s,
+    @property
+    def _mosaic(self) -> MosaicWatcher:
+        assert self._watchers.mosaic is not None
+        return self._watchers.mosaic
+
+    def add(self, step: Step) -> None:
+        """Note a frame. Only so many different reasons are told apart."""
+        self.frames += 1
+        reason = self._mosaic.reason
+        is_known = reason in self._reasons or len(self._reasons) < _MOST_REASONS
+        self._reasons[reason if is_known else _OTHER] += 1
+        self._ms.add(step.stage_ms["total"] + self._mosaic.paint_ms)
+        if step.camera.is_keyframe and step.features is not None:
+            self._features[step.frame.index] = len(step.features)
+
+    def build(
+        self,
+        skipped: Sequence[Skipped],
+        corrupt_packets: int,
+        ended: str,
+        live: LiveStatus | None = None,
+    ) -> MosaicSummary:
+        """The summary of the run, once its mosaic is complete."""
+        graph, mosaic, exported = self._graph, self._mosaic.mosaic, self._mosaic.exported
+        links, edges = graph.links, graph.edges
+        names = {index: f"frame {index}" for index in graph.keyframes}
+        placed = self._reasons[""]
+        notes = (*mosaic.notes, *(exported.notes if exported is not None else ()))
+        models = Counter(link.model.value for link in links if link.model is not None)
+        agreement = [link.overlap_ncc for link in links if np.isfinite(link.overlap_ncc)]
+        return MosaicSummary(
+            source=self._source.info.name,
+            settings=self._settings,
+            images=self._placements(),
+            links=tuple(
+                LinkSummary.of(link, names, is_loop=edge.is_loop)
+                for link, edge in zip(links, edges, strict=False)
+            ),
+            frames_used=placed,
+            frames_skipped=self._skipped(skipped),
+            transformation_model=models.most_common(1)[0][0] if models else None,
+            projection="planar" if placed else None,
+            reference=next(iter(names.values()), None),
+            canvas_wh=exported.size_wh if exported is not None else None,
+            scale=exported.scale if exported is not None else 1.0,
+            rmse_px=_rmse_px(links, graph),
+            overlap_ncc=float(np.mean(agreement)) if agreement else float("nan"),
+            time_s=time.perf_counter() - self._began[0],
+            cpu_s=time.process_time() - self._began[1],
+            peak_rss_mb=peak_rss_mb(),
+            ms_per_frame=self._ms.quantile(0.5),
+            ended=ended,
+            notes=notes,
+            live=live,
+            more=self._more(edges, exported, corrupt_packets),
         )
-        for index, keyframe in keyframes.items()
-    )
+
+    def _skipped(self, skipped: Sequence[Skipped]) -> dict[str, int]:
+        """Frames and pictures that were not placed, by reason, most first."""
+        counts = Counter({reason: n for reason, n in self._reasons.items() if reason})
+        counts.update(picture.reason for picture in skipped)
+        return dict(counts.most_common())
+
+    def _placements(self) -> tuple[Placement, ...]:
+        """The keyframes, with the features that their frames had."""
+        return tuple(
+            Placement(
+                index=index,
+                name=f"frame {index}",
+                features=self._features.get(index, 0),
+                status=Status.USED,
+                world_from_picture=keyframe.world_from_keyframe,
+                time_s=keyframe.time_s,
+            )
+            for index, keyframe in self._graph.keyframes.items()
+        )
+
+    def _more(
+        self, edges: Sequence[KeyframeEdge], exported: Exported | None, corrupt_packets: int
+    ) -> dict[str, Any]:
+        mosaic, p95_ms = self._mosaic.mosaic, self._ms.quantile(0.95)
+        more: dict[str, Any] = {
+            "keyframes": len(self._graph.keyframes),
+            "loops_closed": sum(edge.is_loop for edge in edges),
+            "frames_painted": mosaic.figures.painted,
+            "frames_kept": mosaic.views,
+            "tiles": mosaic.tiles,
+            "spilled_mb": round(mosaic.spilled_mb, 1),
+            "ms_per_frame_p95": None if p95_ms is None else round(p95_ms, 2),
+            "corrupt_packets": corrupt_packets,
+        }
+        if exported is not None and exported.tally.overlap:
+            tally = exported.tally
+            more["ghost_index"] = round(tally.contested / tally.overlap, 5)
+            more["ghost_index_undecided"] = round(tally.undecided / tally.overlap, 5)
+            more["ghost_index_definition"] = (
+                "share of the pixels seen more than once where samples disagree; undecided: where "
+                "no majority could tell what stands there"
+            )
+        return more
 
 
 def _rmse_px(links: Sequence[Link], graph: _Graph) -> float:
@@ -202,31 +179,3 @@ def _rmse_px(links: Sequence[Link], graph: _Graph) -> float:
         total += float(np.sum(errors[np.isfinite(errors)]))
         count += int(np.count_nonzero(np.isfinite(errors)))
     return float(np.sqrt(total / (2 * count))) if count else float("nan")
-
-
-def _more(
-    log: FrameLog,
-    edges: Sequence[KeyframeEdge],
-    graph: _Graph,
-    mosaic: StreamMosaic,
-    exported: Exported | None,
-) -> dict[str, Any]:
-    figures = mosaic.figures
-    more: dict[str, Any] = {
-        "keyframes": len(graph.keyframes),
-        "loops_closed": sum(edge.is_loop for edge in edges),
-        "frames_painted": figures.painted,
-        "frames_kept": mosaic.views,
-        "tiles": mosaic.tiles,
-        "spilled_mb": round(mosaic.spilled_mb, 1),
-        "ms_per_frame_p95": None if log.p95_ms is None else round(log.p95_ms, 2),
-    }
-    if exported is not None and exported.tally.overlap:
-        tally = exported.tally
-        more["ghost_index"] = round(tally.contested / tally.overlap, 5)
-        more["ghost_index_undecided"] = round(tally.undecided / tally.overlap, 5)
-        more["ghost_index_definition"] = (
-            "share of the pixels seen more than once where samples disagree; undecided: where no "
-            "majority could tell what stands there"
-        )
-    return more

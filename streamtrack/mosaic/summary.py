@@ -21,7 +21,7 @@ import math
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from streamtrack.mosaic.types import Link, Placement, Status
 from streamtrack.settings import Settings
 from streamtrack.summary_text import known, markdown, number, write_json
 from streamtrack.types import Matrix, Size
+
+if TYPE_CHECKING:
+    from streamtrack.sources.live_status import LiveStatus
 
 _MORE_LABELS = {
     "spilled_mb": ("Spilled to disk", " MB"),
@@ -138,6 +141,7 @@ class MosaicSummary:
     ms_per_frame: float | None = None
     ended: str = ""
     notes: tuple[str, ...] = ()
+    live: LiveStatus | None = None
     more: dict[str, Any] = field(default_factory=dict)
     """Further figures for JSON and table, by snake_case name (loops closed, tiles ...)."""
 
@@ -171,6 +175,7 @@ class MosaicSummary:
             "peak_rss_mb": known(self.peak_rss_mb),
             "ended": self.ended,
             "notes": list(self.notes),
+            "live": None if self.live is None else self.live.to_json(),
             **self.more,
         }
 
@@ -200,6 +205,7 @@ class MosaicSummary:
         rows += [("Note", note) for note in self.notes]
         if self.ms_per_frame is not None:
             rows.append(("Time a frame", f"{self.ms_per_frame:.1f} ms"))
+        rows += [] if self.live is None else self.live.rows()
         rows.append(("Time", f"{self.time_s:.2f} s, CPU {self.cpu_s:.2f} s"))
         rows.append(("Peak memory", number(self.peak_rss_mb, 0, " MB")))
         if self.ended:

@@ -8,10 +8,13 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 from streamtrack.meters import LogHistogram
+from streamtrack.summary_text import number
 
 _MAX_EVENTS = 1000
+_IN_SUMMARY = ("captured", "dropped", "thinned", "lost", "damaged", "reconnects", "stalls")
 
 
 class LiveState(StrEnum):
@@ -67,6 +70,21 @@ class LiveStatus:
     def reconnects(self) -> int:
         """Openings after the first."""
         return max(0, self.openings - 1)
+
+    def to_json(self) -> dict[str, Any]:
+        """What belongs into the summary of a run."""
+        counts = {name: getattr(self, name) for name in _IN_SUMMARY}
+        age_ms = {"p50": self.age_ms_p50, "p95": self.age_ms_p95}
+        return {**counts, "away_s": self.away_s, "frame_age_ms": age_ms}
+
+    def rows(self) -> list[tuple[str, str]]:
+        """The same as (label, value) pairs for a table."""
+        counts = ", ".join(f"{name} {getattr(self, name)}" for name in _IN_SUMMARY)
+        p50, p95 = number(self.age_ms_p50, 0), number(self.age_ms_p95, 0)
+        return [
+            ("Live pictures", f"{counts}, away {self.away_s:.1f} s"),
+            ("Age of a frame when done", f"median {p50} ms, p95 {p95} ms"),
+        ]
 
 
 _COUNTED = (

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -171,11 +172,16 @@ class _MotLines:
 
     def __init__(self) -> None:
         self._ids: dict[str, int] = {}
+        self._count = itertools.count(1)
 
     def __call__(self, step: Step) -> str:
         lines = []
+        # Whatever is not in a step has ended, and its name does not come again.
+        self._ids = {
+            track.name: self._ids.get(track.name) or next(self._count) for track in step.tracks
+        }
         for track in step.tracks:
-            target = self._ids.setdefault(track.name, len(self._ids) + 1)
+            target = self._ids[track.name]
             quad = _finite_quad(track)
             if quad is not None:
                 x0, y0, x1, y1 = bounding_box(quad)

@@ -8,7 +8,8 @@ inliers, transformation model. Definitions:
     inliers        those of them that agree with the estimate
     rmse_px        mean over the tracked frames of the inliers' RMS transfer error
     budget         null without one; ``frames_at_level`` counts frames by level of work, full first
-    automatic      targets found by their motion; ``most_at_once`` of them tracked in one frame
+    automatic      targets found by their motion; ``most_at_once`` of them tracked in one frame;
+                   of more than 1000 those seen last are listed
     losses         changes from tracking to lost
     ms_per_frame   wall time of a frame, its stages together; quantiles are nearest-rank, from
                    bins 1 % wide, so right to 0.5 %; ``by_stage`` is the mean over all frames
@@ -33,6 +34,8 @@ from streamtrack.settings import Settings
 from streamtrack.sources.live_status import LiveStatus
 from streamtrack.summary_text import cell, markdown, number, write_json
 from streamtrack.types import AUTO_STAGE, Size, Skipped, SourceInfo, Step, Track, TrackState
+
+_MOST_FOUND = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +149,7 @@ class Summary:
     live: LiveStatus | None = None
     camera_notes: tuple[str, ...] = ()
     auto_at_once: int | None = None
+    auto_count: int = 0
 
     @property
     def given(self) -> tuple[TargetSummary, ...]:
@@ -252,7 +256,7 @@ class Summary:
         if self.auto_at_once is None:
             return None
         return {
-            "count": len(self.targets) - len(self.given),
+            "count": self.auto_count,
             "most_at_once": self.auto_at_once,
         }
 
@@ -264,7 +268,7 @@ class Summary:
             return [("Automatic targets", "none: nothing was seen to move against the background")]
         lives = sorted(target.frames_tracked for target in found)
         text = (
-            f"{len(found)}, at most {self.auto_at_once} at once; tracked in "
+            f"{self.auto_count}, at most {self.auto_at_once} at once; tracked in "
             f"{lives[len(lives) // 2]} frames in the median, {lives[-1]} at most; "
             f"lost {sum(target.losses for target in found)} times"
         )
@@ -336,6 +340,7 @@ class SummaryBuilder:
         self._match_counts: Counter[int] = Counter()
         self._targets: dict[str, _TargetSums] = {}
         self._auto_at_once: int | None = None
+        self._auto_count = 0
         self._frames_at_level = [0] * len(LEVELS)
         self._ms = LogHistogram()
         self._stage_ms: dict[str, float] = {}
@@ -361,10 +366,22 @@ class SummaryBuilder:
         self._add_times(step.stage_ms)
 
     def _add_track(self, track: Track, frame: int) -> None:
-        self._targets.setdefault(track.name, _TargetSums(track.name)).add(track, frame)
+        if track.name not in self._targets:
+            self._targets[track.name] = _TargetSums(track.name)
+            if track.is_found:
+                self._auto_count += 1
+                self._forget_found()
+        self._targets[track.name].add(track, frame)
         if track.state is TrackState.TRACKING and not track.is_found:
             self._match_counts[len(track.evidence)] += 1
             self._inliers.add(track.evidence.inliers)
+
+    def _forget_found(self) -> None:
+        """Of very many automatic targets only those seen last are remembered."""
+        found = [target for target in self._targets.values() if target.is_found]
+        if len(found) >= _MOST_FOUND:
+            oldest = min(found, key=lambda target: target.last_seen or 0)
+            del self._targets[oldest.name]
 
     def _add_times(self, stage_ms: dict[str, float]) -> None:
         stages = {name: ms for name, ms in stage_ms.items() if name != "total"}
@@ -409,4 +426,5 @@ class SummaryBuilder:
             live=live,
             camera_notes=self._camera.all(),
             auto_at_once=self._auto_at_once,
+            auto_count=self._auto_count,
         )

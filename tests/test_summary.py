@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from streamtrack.meters import LogHistogram, Mean, peak_rss_mb
 from streamtrack.settings import Settings, build_settings
 from streamtrack.summary import Summary, SummaryBuilder
 from streamtrack.types import (
+    AUTO_STAGE,
     CameraPose,
     Evidence,
     Features,
@@ -217,3 +219,18 @@ def test_json_file_is_whole(tmp_path: Path) -> None:
     (tmp_path / "full.json").symlink_to("/dev/full")
     with pytest.raises(OutputError, match=r"full\.json: no space left"):
         summary.write_json(tmp_path / "full.json")
+
+
+def test_of_very_many_automatic_targets_all_are_counted_and_the_last_listed() -> None:
+    def found(number: int) -> Track:
+        return replace(_track("tracking", f"auto-{number}"), is_found=True)
+
+    steps = [
+        replace(_step(n, _track("tracking"), found(n), found(n + 1)), stage_ms={AUTO_STAGE: 1.0})
+        for n in range(1, 1100)
+    ]
+    summary = _summary(*steps)
+    names = [target.name for target in summary.targets]
+    assert len(names) == 1001 and names[0] == "board" and names[-1] == "auto-1100"
+    assert summary.auto_count == 1100 and summary.auto_at_once == 2
+    assert ("Automatic targets", "1100") in [(a, b[:4]) for a, b in summary.rows()]

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import json
 import logging
 import math
 import os
@@ -10,7 +11,7 @@ import sys
 import threading
 import time
 import warnings
-from dataclasses import replace
+from dataclasses import asdict, replace
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
@@ -193,7 +194,7 @@ def test_layout_and_properties_are_embedded(recorded):
         "width": 160,
         "height": 120,
         "rate_hz": 25.0,
-        "settings": Settings().model_dump_json(),
+        "settings": json.dumps(asdict(Settings())),
     }
     for name, value in expected.items():
         assert rrd_columns(recorded, "/__properties/run", name, None)[1] == [[value]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from types import TracebackType
 from typing import Any, Self
 
@@ -75,7 +75,8 @@ class Streamtrack(Follower):
 
 def _streamtrack(name: str, title: str, values: dict[str, Any]) -> Method:
     settings = build_settings(values)
-    parameters = settings.model_dump(mode="json", exclude={"recording"})
+    parameters = asdict(settings)
+    del parameters["recording"]
     return Method(
         name,
         title,

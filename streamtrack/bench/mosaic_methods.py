@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import cv2
@@ -55,7 +55,8 @@ class PairMethod:
 def own_method(detector: str, descriptor: str, name: str = "") -> PairMethod:
     """streamtrack's own registration with a detector and a descriptor, defaults otherwise."""
     settings = build_settings({"features": {"detector": detector, "descriptor": descriptor}})
-    parameters = settings.model_dump(mode="json", include={"features", "matching", "registration"})
+    used = (settings.features, settings.matching, settings.registration)
+    parameters = {section.section: asdict(section) for section in used}
 
     def make() -> Callable[[Image, Image], Outcome]:
         registrar = PictureRegistrar(settings)

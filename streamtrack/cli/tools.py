@@ -5,18 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from streamtrack.cli.common import StopOnSignal
+from streamtrack.cli.options import Argument, Option
 from streamtrack.errors import StreamtrackError
 
 
 def synth(
-    uri: Annotated[str, typer.Argument(metavar="URI", help="synthetic://SCENE?seed=1&frames=300")],
+    uri: Annotated[str, Argument(metavar="URI", help="synthetic://SCENE?seed=1&frames=300")],
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Video file, or a folder for PNG pictures.")
+        Path, Option("--output", "-o", help="Video file, or a folder for PNG pictures.")
     ],
-    truth: Annotated[Path | None, typer.Option(help="CSV of the exact truth.")] = None,
+    truth: Annotated[Path | None, Option(help="CSV of the exact truth.")] = None,
 ) -> None:
     """Write a synthetic sequence and its exact truth to files."""
     from streamtrack.synth import write_synthetic
@@ -28,11 +27,11 @@ def synth(
 
 
 def view(
-    recording: Annotated[Path, typer.Argument(metavar="FILE.rrd", help="The recording to open.")],
-    web: Annotated[bool, typer.Option("--web", help="In the browser, on 127.0.0.1.")] = False,
-    port: Annotated[int | None, typer.Option(help="Port of the web page.")] = None,
-) -> None:
+    recording: Annotated[Path, Argument(metavar="FILE.rrd", help="The recording to open.")],
+    web: Annotated[bool, Option("--web", help="In the browser, on 127.0.0.1.")] = False,
+    port: Annotated[int | None, Option(help="Port of the web page.")] = None,
+) -> int:
     """Open a recording in the Rerun viewer."""
     from streamtrack.viewer import view as open_viewer
 
-    raise typer.Exit(open_viewer(recording, web=web, port=port))
+    return open_viewer(recording, web=web, port=port)

@@ -165,13 +165,14 @@ def read_coverage(path: str | Path) -> Image | None:
 def _decode(data: npt.NDArray[np.uint8]) -> npt.NDArray[Any] | None:
     with _quiet_opencv():
         try:
-            # Unchanged keeps 16 bits, grey and alpha, but also leaves the picture lying.
+            if _is_jpeg(data):
+                return cv2.imdecode(data, cv2.IMREAD_ANYCOLOR)  # grey stays grey, and all stand
+            # Unchanged keeps 16 bits and alpha, but also leaves the picture lying.
             raw = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
             if raw is None:
                 return None
             if raw.dtype == np.uint8 and (raw.ndim == 2 or raw.shape[2] == 3) and _may_lie(data):
-                colour = cv2.IMREAD_GRAYSCALE if raw.ndim == 2 else cv2.IMREAD_COLOR
-                raw = cv2.imdecode(data, colour)
+                raw = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR)
         except cv2.error:  # A size beyond OpenCV's limit, for one.
             return None
     return None if raw is None or raw.size == 0 else np.asarray(raw)
@@ -179,9 +180,12 @@ def _decode(data: npt.NDArray[np.uint8]) -> npt.NDArray[Any] | None:
 
 def _may_lie(data: npt.NDArray[np.uint8]) -> bool:
     """True if there may be an EXIF orientation: saves decoding twice where there is none."""
-    is_jpeg = data[:2].tobytes() == b"\xff\xd8"  # Keeps it in front; others may keep it last.
-    text = data[: 65536 if is_jpeg else None].tobytes()
+    text = data.tobytes()
     return any(mark in text for mark in (b"Exif\0", b"eXIf", b"EXIF"))
+
+
+def _is_jpeg(data: npt.NDArray[np.uint8]) -> bool:
+    return data[:2].tobytes() == b"\xff\xd8"
 
 
 @contextmanager

@@ -185,5 +185,8 @@ class FullSizeGraph:
         pose = self._graph.world_from_frame(index)
         return None if pose is None else self._full(pose)
 
+    def keep(self, index: int) -> None:
+        self._graph.keep(index)
+
     def _full(self, pose: Matrix) -> Matrix:
         return self._full_from_small @ pose @ inverted(self._full_from_small)

@@ -65,6 +65,19 @@ def test_frames_move_with_their_keyframe(make_picture: MakePicture) -> None:
     assert graph.world_from_frame(11) is None
 
 
+def test_frames_that_are_kept_move_however_old_they_are(make_picture: MakePicture) -> None:
+    graph = KeyframeGraph(most_frames=20)
+    graph.add_keyframe(0, 0.0, picture(make_picture), np.eye(3))
+    for index in range(1, 200):
+        graph.add_frame(index, 0, geometry.translation(index, 0))
+        if index == 7:
+            graph.keep(7)
+    graph.move({0: geometry.translation(0, 5)})
+    for index in (0, 7, 199):
+        np.testing.assert_allclose(graph.world_from_frame(index), geometry.translation(index, 5))
+    assert graph.world_from_frame(8) is None
+
+
 def test_what_was_taken_since_is_carried_along(make_picture: MakePicture) -> None:
     graph = graph_of(4, picture(make_picture))
     graph.move({0: np.eye(3), 10: geometry.translation(57, 2)})

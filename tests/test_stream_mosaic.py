@@ -240,6 +240,9 @@ class Graph:
     keyframes: dict[int, Any] = field(default_factory=dict)
     edges: tuple[Any, ...] = ()
 
+    def keep(self, index: int) -> None:
+        return None
+
     def world_from_frame(self, index: int) -> Matrix | None:
         return self.poses.get(index)
 

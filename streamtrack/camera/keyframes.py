@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from streamtrack import geometry
+from streamtrack.camera.frame_poses import FramePose, FramePoses
 from streamtrack.errors import OutputError
 from streamtrack.mosaic.spill import Slot, SpillFile
 from streamtrack.mosaic.types import KeyframeEdge, Link
@@ -100,27 +101,23 @@ class Keyframe:
         return float(x), float(y)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FramePose:
-    """A frame's pose against a keyframe."""
-
-    keyframe: int
-    keyframe_from_frame: Matrix
-
-
 class KeyframeGraph:
     """Keyframes, the verified links between them, and every frame's pose against one of them.
 
-    ``revision`` counts how often keyframes were moved. One thread adds; any may read.
+    ``revision`` counts how often keyframes were moved. One thread adds, and asks for frames; any
+    may read what there is of keyframes. Of more than ``most_frames`` (None: no limit) the oldest
+    are forgotten, except those that are to be kept.
     """
 
-    def __init__(self, max_pictures_mb: float = _MAX_PICTURES_MB) -> None:
+    def __init__(
+        self, max_pictures_mb: float = _MAX_PICTURES_MB, most_frames: int | None = None
+    ) -> None:
         self._pictures = PictureStore(max_pictures_mb)
         self._lock = threading.Lock()
         self._keyframes: dict[int, Keyframe] = {}
         self._links: list[Link] = []
         self._edges: list[KeyframeEdge] = []
-        self._frames: dict[int, FramePose] = {}
+        self._frames = FramePoses(most_frames)
         self._revision = 0
 
     @property
@@ -149,8 +146,8 @@ class KeyframeGraph:
         return {index: keyframe.world_from_keyframe for index, keyframe in self._keyframes.items()}
 
     def world_from_frame(self, index: int) -> Matrix | None:
-        """Where a frame lies by what is known now; None if it was refused or never seen."""
-        frame = self._frames.get(index)
+        """Where a frame lies by what is known now; None if it was refused, or is forgotten."""
+        frame = self.frame_pose(index)
         if frame is None:
             return None
         world_from_keyframe = self._keyframes[frame.keyframe].world_from_keyframe
@@ -158,7 +155,13 @@ class KeyframeGraph:
 
     def frame_pose(self, index: int) -> FramePose | None:
         """The frame's own measurement: against which keyframe, and where in it."""
+        if index in self._keyframes:
+            return FramePose(index, np.eye(3))
         return self._frames.get(index)
+
+    def keep(self, index: int) -> None:
+        """Never forget where this frame lies."""
+        self._frames.keep(index)
 
     def add_keyframe(
         self,
@@ -176,12 +179,11 @@ class KeyframeGraph:
         with self._lock:
             # Readers may be going through the old dict: it is replaced, not changed.
             self._keyframes = {**self._keyframes, index: keyframe}
-            self._frames[index] = FramePose(index, np.eye(3))
         return keyframe
 
     def add_frame(self, index: int, keyframe: int, keyframe_from_frame: Matrix) -> None:
         """Remember where a frame lies against a keyframe."""
-        self._frames[index] = FramePose(keyframe, keyframe_from_frame)
+        self._frames.add(index, FramePose(keyframe, keyframe_from_frame))
 
     def add_link(self, link: Link, is_loop: bool) -> None:
         """Join two keyframes. The link's ``a`` and ``b`` are indices of keyframes."""

@@ -42,6 +42,8 @@ _MAX_STRETCH = 4.0
 _MAX_STEPS_AHEAD = 8
 _REFERENCES_KEPT = 6
 _MARGIN_PX = 8.0  # of the usual level, around the targets
+_MOST_LIVE_FRAMES = 200_000
+"""Poses of frames remembered of a stream without end, besides those in a mosaic: two hours."""
 
 
 class CameraEstimator(Protocol):
@@ -92,7 +94,7 @@ class MovingCamera:
     """
 
     def __init__(self, settings: Settings, *, is_live: bool = False) -> None:
-        self.graph = KeyframeGraph()
+        self.graph = KeyframeGraph(most_frames=_MOST_LIVE_FRAMES if is_live else None)
         self._levels = LevelCache(self.graph)
         self._loops = LoopCloser(self.graph, is_live)
         self._relocaliser = Relocaliser(self.graph, settings)

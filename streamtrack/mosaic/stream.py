@@ -74,6 +74,10 @@ class PoseGraph(Protocol):
         """The pose of a frame as it is known now."""
         ...
 
+    def keep(self, index: int) -> None:
+        """A frame of which the pose will always be asked for."""
+        ...
+
 
 @dataclass(slots=True)
 class StreamFigures:
@@ -231,6 +235,8 @@ class StreamMosaic:
         world_from_frame = self._known_pose(given.frame.index, given.world_from_frame)
         try:
             view = store.add(given.frame, world_from_frame, given.quads, given.moment)
+            if self._graph is not None:
+                self._graph.keep(given.frame.index)
             self._paint(given.frame.image, view)
             for dropped in store.thin(view):
                 self._renderer.forget(dropped)

@@ -74,8 +74,8 @@ def test_work_that_does_not_fit_is_tried_ever_more_rarely() -> None:
 def test_lateness_lowers_the_work_although_tracking_is_quick() -> None:
     source = SyntheticSource(_SCENE)
     target = Target("t", np.asarray(source.truth(0).quad, np.float32))
-    settings = build_settings({"tracker": {"budget_ms": 2000.0}})
-    frames = [replace(source.frame(n), waited_s=0.0 if n < 8 else 9.0) for n in range(25)]
+    settings = build_settings({"tracker": {"budget_ms": 100_000.0}})
+    frames = [replace(source.frame(n), waited_s=0.0 if n < 8 else 450.0) for n in range(25)]
     levels = [step.work_level for step in track(FrameList(frames), [target], settings)]
     assert set(levels[:9]) == {0}
     assert levels[-1] == LEVELS[-1].index

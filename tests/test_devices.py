@@ -34,7 +34,7 @@ def listed(emulator: Emulator, *arguments: str) -> str:
         env=emulator.env(),
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=600,
     )
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout

@@ -33,7 +33,7 @@ from streamtrack.camera.auto import make_camera
 from streamtrack.features import FeatureExtractor
 from streamtrack.frame_view import FrameView
 from streamtrack.geometry import bounding_box
-from streamtrack.settings import build_settings
+from streamtrack.settings import Settings
 from streamtrack.sources.synthetic import SyntheticSource
 
 SHOWN_SHARE = 0.3
@@ -57,7 +57,7 @@ class Run:
 
 
 def run_own(uri: str, camera_mode: str) -> Run:
-    settings = build_settings({"camera": camera_mode})
+    settings = Settings.model_validate({"camera": camera_mode})
     source = SyntheticSource(uri)
     extractor, camera, auto = (
         FeatureExtractor(settings.features),

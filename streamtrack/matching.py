@@ -56,9 +56,7 @@ def _match(
     if len(rows) == 0:
         return _no_matches()
     # Only the few current rows still in question are matched back, over all reference rows.
-    is_wanted = np.zeros(len(cur), np.bool_)
-    is_wanted[best[rows]] = True
-    wanted, place = np.flatnonzero(is_wanted), np.cumsum(is_wanted)[best[rows]] - 1
+    wanted, place = np.unique(best[rows], return_inverse=True)
     back_allowed = None if allowed is None else np.ascontiguousarray(allowed[:, wanted].T)
     _, back = _nearest(cur[wanted], ref, back_allowed, 1)
     rows = rows[back[place, 0] == rows]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Sequence
-from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -126,7 +125,10 @@ def _extractors(settings: Settings) -> list[FeatureExtractor]:
     """One for each level of work; the first finds all the features that the settings ask for."""
     most = settings.features.max_features
     counts = [max(8, round(most * level.feature_share)) for level in LEVELS]
-    return [FeatureExtractor(replace(settings.features, max_features=count)) for count in counts]
+    return [
+        FeatureExtractor(settings.features.model_copy(update={"max_features": count}))
+        for count in counts
+    ]
 
 
 def _follow_all(

@@ -1,20 +1,19 @@
 """Settings of every stage; command-line flags and a TOML file build the same objects.
 
-Unknown names are refused. All settings are frozen: a run has one set from start to end. They are
-dataclasses that check themselves (`sections`), for models of pydantic took a quarter of a second to
-import and build, more than joining two pictures does.
+Unknown names are refused. All settings are frozen: a run has one set from start to end.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+import tomllib
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias, get_args
+from typing import Any, Literal, Self, TypeAlias, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from streamtrack.errors import UsageError, unknown_name
 from streamtrack.recording.series import check_keep, parse_keep, parse_rotate
-from streamtrack.sections import Range, Section
 
 Detector: TypeAlias = Literal["harris", "fast", "agast", "gftt", "brisk", "orb", "sift", "akaze"]
 Descriptor: TypeAlias = Literal["freak", "brisk", "orb", "teblid", "sift", "akaze"]
@@ -60,167 +59,159 @@ DEFAULT_THRESHOLDS: dict[str, float] = {
 """The detectors' own thresholds; features.py says what each means."""
 
 
-_POSITIVE = Range(above=0)
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-@dataclass(frozen=True)
-class FeatureSettings(Section):
-    """Detection and description of keypoints; ``threshold`` None is the detector's default."""
+class FeatureSettings(_Section):
+    """Detection and description of keypoints."""
 
-    section: ClassVar[str] = "features"
     detector: Detector = "harris"
-    threshold: float | None = None
+    threshold: float | None = Field(
+        default=None, description="detector's own threshold; None = default"
+    )
     descriptor: Descriptor = "freak"
-    max_features: Annotated[int, Range(least=8, most=100_000)] = 1000
+    max_features: int = Field(default=1000, ge=8, le=100_000)
 
     @property
     def threshold_or_default(self) -> float:
         return DEFAULT_THRESHOLDS[self.detector] if self.threshold is None else self.threshold
 
 
-@dataclass(frozen=True)
-class MatchingSettings(Section):
-    """Matching of descriptors; ``max_ratio`` is the best over the second-best distance."""
+class MatchingSettings(_Section):
+    """Matching of descriptors."""
 
-    section: ClassVar[str] = "matching"
-    max_ratio: Annotated[float, Range(above=0, most=1)] = 0.8
+    max_ratio: float = Field(default=0.8, gt=0, le=1, description="best over second-best distance")
 
 
-@dataclass(frozen=True)
-class RegistrationSettings(Section):
+class RegistrationSettings(_Section):
     """Robust estimate and its gate."""
 
-    section: ClassVar[str] = "registration"
     model: ModelChoice = "auto"
-    inlier_threshold_px: Annotated[float, _POSITIVE] = 3.0
-    min_inliers: Annotated[int, Range(least=4)] = 10
-    seed: Annotated[int, Range(least=0, most=2**31 - 1)] = 1
+    inlier_threshold_px: float = Field(default=3.0, gt=0, allow_inf_nan=False)
+    min_inliers: int = Field(default=10, ge=4)
+    seed: int = Field(default=1, ge=0, le=2**31 - 1)
 
 
-@dataclass(frozen=True)
-class TrackerSettings(Section):
-    """Following of targets; ``budget_ms`` is the time a frame, None without limit."""
+class TrackerSettings(_Section):
+    """Following of targets."""
 
-    section: ClassVar[str] = "tracker"
     method: Method = "hybrid"
-    budget_ms: Annotated[float | None, _POSITIVE] = None
+    budget_ms: float | None = Field(
+        default=None, gt=0, allow_inf_nan=False, description="time a frame; None = no limit"
+    )
 
 
-@dataclass(frozen=True)
-class RecordingSettings(Section):
-    """Recording for the Rerun viewer.
+class RecordingSettings(_Section):
+    """Recording for the Rerun viewer."""
 
-    max_asset_mb  largest file that is embedded whole
-    rotate        a new file after this size or time: 100MB, 10min, or both
-    keep          remove the oldest files beyond this size or age: 2GB, 7d
-    """
-
-    section: ClassVar[str] = "recording"
     video: VideoMode = VideoMode.AUTO
-    jpeg_quality: Annotated[int, Range(least=1, most=100)] = 80
-    max_asset_mb: Annotated[float, _POSITIVE] = 200.0
-    rotate: str | None = None
-    keep: str | None = None
+    jpeg_quality: int = Field(default=80, ge=1, le=100)
+    max_asset_mb: float = Field(
+        default=200.0, gt=0, description="largest file that is embedded whole"
+    )
+    rotate: str | None = Field(
+        default=None, description="a new file after this size or time: 100MB, 10min, or both"
+    )
+    keep: str | None = Field(
+        default=None, description="remove the oldest files beyond this size or age: 2GB, 7d"
+    )
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    @model_validator(mode="after")
+    def _check_files(self) -> Self:
         check_keep(parse_rotate(self.rotate), parse_keep(self.keep))
+        return self
 
 
-@dataclass(frozen=True)
-class MosaicSettings(Section):
-    """Mosaics of pictures and of streams.
+class MosaicSettings(_Section):
+    """Mosaics of pictures and of streams."""
 
-    max_megapixels  largest canvas that is written
-    max_memory_mb   tiles kept in memory; more go to disk
-    """
-
-    section: ClassVar[str] = "mosaic"
     warping: Warping = "linear"
     blending: Blending = "multiband"
     projection: Projection = "auto"
-    max_megapixels: Annotated[float, _POSITIVE] = 100.0
-    max_memory_mb: Annotated[float, _POSITIVE] = 400.0
+    max_megapixels: float = Field(
+        default=100.0, gt=0, allow_inf_nan=False, description="largest canvas that is written"
+    )
+    max_memory_mb: float = Field(
+        default=400.0,
+        gt=0,
+        allow_inf_nan=False,
+        description="tiles kept in memory; more go to disk",
+    )
 
 
-@dataclass(frozen=True)
-class LiveSettings(Section):
-    """Cameras and network streams.
+class LiveSettings(_Section):
+    """Cameras and network streams."""
 
-    max_fps          pictures beyond are left out
-    stall_timeout_s  silence after which a source is reopened
-    open_timeout_s   to the first picture of a network
-    retries          openings in a row; None = for ever
-    newest_only      false: read every picture, however late it gets
-    """
-
-    section: ClassVar[str] = "live"
-    max_fps: Annotated[float | None, _POSITIVE] = None
-    stall_timeout_s: Annotated[float, _POSITIVE] = 5.0
-    open_timeout_s: Annotated[float, _POSITIVE] = 15.0
-    retries: Annotated[int | None, Range(least=0)] = None
-    newest_only: bool = True
+    max_fps: float | None = Field(
+        default=None, gt=0, allow_inf_nan=False, description="pictures beyond are left out"
+    )
+    stall_timeout_s: float = Field(
+        default=5.0, gt=0, allow_inf_nan=False, description="silence after which it is reopened"
+    )
+    open_timeout_s: float = Field(
+        default=15.0, gt=0, allow_inf_nan=False, description="to the first picture of a network"
+    )
+    retries: int | None = Field(default=None, ge=0, description="in a row; None = for ever")
+    newest_only: bool = Field(
+        default=True, description="false: read every picture, however late it gets"
+    )
     rtsp_transport: Literal["tcp", "udp"] = "tcp"
 
 
-@dataclass(frozen=True)
-class WorldSettings(Section):
-    """What a world pixel is on the ground; nothing of it is known unless given.
+class WorldSettings(_Section):
+    """What a world pixel is on the ground; nothing of it is known unless given."""
 
-    ``ground`` are known points: x, y in pixels of the first frame, X, Y in units.
-    """
-
-    section: ClassVar[str] = "world"
-    px_per_unit: Annotated[float | None, _POSITIVE] = None
-    ground: tuple[tuple[float, float, float, float], ...] = ()
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.px_per_unit is not None and self.ground:
-            raise UsageError(
-                "setting world: a scale and known points contradict each other: give one of them"
-            )
-
-
-@dataclass(frozen=True)
-class StabilizeSettings(Section):
-    """How a video is held still; ``reach_s`` is how far a smooth path looks back and ahead."""
-
-    section: ClassVar[str] = "stabilize"
-    path: StabilizePath = "smooth"
-    reach_s: Annotated[float, Range(above=0, most=10)] = 0.8
-
-
-@dataclass(frozen=True)
-class Settings(Section):
-    """All of them; pictures wider than ``max_width`` are worked on smaller, None as they are."""
-
-    features: FeatureSettings = field(default_factory=FeatureSettings)
-    matching: MatchingSettings = field(default_factory=MatchingSettings)
-    registration: RegistrationSettings = field(default_factory=RegistrationSettings)
-    tracker: TrackerSettings = field(default_factory=TrackerSettings)
-    camera: CameraMode = "fixed"
-    max_width: Annotated[int | None, Range(least=32)] = None
-    recording: RecordingSettings = field(default_factory=RecordingSettings)
-    mosaic: MosaicSettings = field(default_factory=MosaicSettings)
-    world: WorldSettings = field(default_factory=WorldSettings)
-    stabilize: StabilizeSettings = field(default_factory=StabilizeSettings)
-    live: LiveSettings = field(default_factory=LiveSettings)
-
-
-_SECTIONS: dict[str, type[Section]] = {
-    kind.section: kind
-    for kind in (
-        FeatureSettings,
-        MatchingSettings,
-        RegistrationSettings,
-        TrackerSettings,
-        RecordingSettings,
-        MosaicSettings,
-        WorldSettings,
-        StabilizeSettings,
-        LiveSettings,
+    px_per_unit: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    ground: tuple[tuple[float, float, float, float], ...] = Field(
+        default=(), description="known points: x, y in pixels of the first frame, X, Y in units"
     )
+
+    @model_validator(mode="after")
+    def _check_one(self) -> Self:
+        if self.px_per_unit is not None and self.ground:
+            raise ValueError("a scale and known points contradict each other: give one of them")
+        return self
+
+
+class StabilizeSettings(_Section):
+    """How a video is held still."""
+
+    path: StabilizePath = "smooth"
+    reach_s: float = Field(
+        default=0.8, gt=0, le=10, description="how far a smooth path looks back and ahead"
+    )
+
+
+class Settings(_Section):
+    """All of them."""
+
+    features: FeatureSettings = FeatureSettings()
+    matching: MatchingSettings = MatchingSettings()
+    registration: RegistrationSettings = RegistrationSettings()
+    tracker: TrackerSettings = TrackerSettings()
+    camera: CameraMode = "fixed"
+    max_width: int | None = Field(
+        default=None, ge=32, description="wider pictures are worked on smaller; None = as they are"
+    )
+    recording: RecordingSettings = RecordingSettings()
+    mosaic: MosaicSettings = MosaicSettings()
+    world: WorldSettings = WorldSettings()
+    stabilize: StabilizeSettings = StabilizeSettings()
+    live: LiveSettings = LiveSettings()
+
+
+_NAMES = {
+    "detector": DETECTORS,
+    "descriptor": DESCRIPTORS,
+    "method": METHODS,
+    "model": MODELS,
+    "camera": CAMERA_MODES,
+    "video": tuple(VideoMode),
+    "path": STABILIZE_PATHS,
+    "warping": WARPINGS,
+    "blending": BLENDINGS,
+    "projection": PROJECTIONS,
 }
 
 
@@ -229,37 +220,30 @@ def build_settings(values: dict[str, Any]) -> Settings:
 
     Raises UsageError, in one line, for unknown names and values out of range.
     """
-    known = {one.name for one in fields(Settings)}
-    built: dict[str, Any] = {}
-    for name, value in values.items():
-        if name not in known:
-            raise unknown_name("setting", name, _setting_names())
-        kind = _SECTIONS.get(name)
-        if kind is None or isinstance(value, kind):
-            built[name] = value
-            continue
-        if not isinstance(value, dict):
-            raise UsageError(f"setting {name} = {value!r}: must be a table of settings")
-        keys = {one.name for one in fields(kind)}
-        for key in value:
-            if key not in keys:
-                raise unknown_name("setting", f"{name}.{key}", _setting_names())
-        built[name] = kind(**value)
-    return Settings(**built)
+    try:
+        return Settings.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        last = str(first["loc"][-1])
+        if first["type"] in ("literal_error", "enum") and last in _NAMES:
+            raise unknown_name(last, str(first["input"]), _NAMES[last]) from None
+        if first["type"] == "extra_forbidden":
+            raise unknown_name("setting", place, _setting_names()) from None
+        raise UsageError(f"setting {place} = {first['input']!r}: {first['msg']}") from None
 
 
 def _setting_names() -> list[str]:
+    sections = {name: getattr(Settings(), name) for name in Settings.model_fields}
     return [
-        f"{one.name}.{key.name}" if one.name in _SECTIONS else one.name
-        for one in fields(Settings)
-        for key in (fields(_SECTIONS[one.name]) if one.name in _SECTIONS else [one])
+        f"{name}.{key}" if isinstance(section, _Section) else name
+        for name, section in sections.items()
+        for key in (type(section).model_fields if isinstance(section, _Section) else [""])
     ]
 
 
 def read_settings_file(path: Path) -> dict[str, Any]:
     """Nested values of a TOML settings file. Raises UsageError if it cannot be read."""
-    import tomllib
-
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

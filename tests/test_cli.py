@@ -217,7 +217,7 @@ def bad_files(folder: Path) -> None:
         (["{clip}", "--target", "bad.png"], 1, "cannot be read"),
         (["{clip}", "--detector", "haris"], 2, "did you mean harris"),
         (["{clip}", "--descriptor", "akaze"], 2, "does not fit detector 'harris'"),
-        (["{clip}", "--threshold", "nan"], 2, "must be a finite number"),
+        (["{clip}", "--threshold", "nan"], 2, "not a positive number"),
         (["{clip}", "--model", "homografy"], 2, "did you mean homography"),
         (["{clip}", "--settings", "bad.toml"], 2, "unknown setting 'features.colour'"),
         (["{clip}", "--start", "99"], 2, "no frame 99"),

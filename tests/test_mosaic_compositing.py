@@ -47,7 +47,7 @@ def painted(
 def test_pictures_of_one_scene_give_that_scene(scene: Image, blending: str) -> None:
     places = {0: (0.0, 0.0), 1: (90.0, 25.0), 2: (60.0, 5.0)}
     pictures = {i: cut(scene, int(x), int(y)) for i, (x, y) in places.items()}
-    found, canvas = painted(pictures, places, MosaicSettings(blending=blending))
+    found, canvas = painted(pictures, places, MosaicSettings.model_validate({"blending": blending}))
     assert canvas.size_wh == (250, 145)
     covered = found[:, :, 3] == 255
     truth = np.zeros(found.shape[:2], np.bool_)
@@ -65,9 +65,9 @@ def test_bands_make_the_same_picture_as_one(scene: Image, blending: str) -> None
     tall = cv2.resize(scene, (260, 600))
     pictures = {i: tall[120 * i : 120 * i + 120, 10 : 10 + 160].copy() for i in range(5)}
     places = {i: (float(7 * i % 3), 100.0 * i) for i in range(5)}
-    settings = MosaicSettings(blending=blending)
+    settings = MosaicSettings.model_validate({"blending": blending})
     whole, canvas = painted(pictures, places, settings)
-    narrow = replace(settings, max_memory_mb=0.1)
+    narrow = settings.model_copy(update={"max_memory_mb": 0.1})
     assert band_count(canvas, settings) == 1
     assert band_count(canvas, narrow) > 3
     banded, _ = painted(pictures, places, narrow)

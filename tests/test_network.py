@@ -14,7 +14,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -40,7 +39,7 @@ from tests import rtsp_server, servers
 from tests.servers import Server, eventually, jpeg, mjpeg, number_of, part, silence
 
 QUICK = LiveSettings(open_timeout_s=8.0, stall_timeout_s=0.6)
-EXACT = replace(QUICK, newest_only=False)
+EXACT = QUICK.model_copy(update={"newest_only": False})
 """Nothing is left out however slow the machine that runs the test is."""
 
 
@@ -117,7 +116,7 @@ def test_a_picture_of_another_size_comes_as_it_is() -> None:
 
 
 def test_thinning_happens_before_the_pictures_are_passed_on() -> None:
-    settings = replace(EXACT, max_fps=10.0)
+    settings = EXACT.model_copy(update={"max_fps": 10.0})
     with (
         Server(mjpeg(range(60), fps=60)) as server,
         NetworkCapture(url(server), settings, with_packets=True) as capture,
@@ -284,7 +283,7 @@ def test_a_reader_ends_with_its_user() -> None:
 def test_a_reader_is_light() -> None:
     program = (
         "import sys, streamtrack.sources._reader_process; "
-        "print(*{'numpy', 'cv2', 'rerun'} & set(sys.modules))"
+        "print(*{'numpy', 'cv2', 'pydantic', 'rerun'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=30)
     assert (done.stdout, done.stderr) == (b"\n", b"")

@@ -41,15 +41,12 @@ def test_unknown_name_is_an_attribute_error() -> None:
 @pytest.mark.parametrize(
     ("module", "banned"),
     [
-        ("streamtrack", ("cv2", "av", "rerun", "numpy")),
-        ("streamtrack.cli", ("cv2", "av", "rerun", "numpy", "rich")),
+        ("streamtrack", ("cv2", "av", "rerun", "numpy", "typer")),
+        ("streamtrack.cli", ("cv2", "av", "rerun", "numpy", "pydantic", "rich")),
         ("streamtrack.sources", ("cv2", "av", "rerun")),
-        ("streamtrack.pipeline", ("av", "rerun", "argparse")),
-        (
-            "streamtrack.mosaic.pictures",
-            ("av", "rerun", "argparse", "pyarrow", "rich", "scipy"),
-        ),
-        ("streamtrack.job", ("av", "rerun", "argparse", "pyarrow")),
+        ("streamtrack.pipeline", ("av", "rerun", "typer")),
+        ("streamtrack.mosaic.pictures", ("av", "rerun", "typer", "pyarrow", "rich", "scipy")),
+        ("streamtrack.job", ("av", "rerun", "typer", "pyarrow")),
     ],
 )
 def test_heavy_modules_are_imported_where_they_are_used(

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import io
-import json
 import logging
 import math
 import os
@@ -11,7 +10,7 @@ import sys
 import threading
 import time
 import warnings
-from dataclasses import asdict, replace
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
@@ -194,7 +193,7 @@ def test_layout_and_properties_are_embedded(recorded):
         "width": 160,
         "height": 120,
         "rate_hz": 25.0,
-        "settings": json.dumps(asdict(Settings())),
+        "settings": Settings().model_dump_json(),
     }
     for name, value in expected.items():
         assert rrd_columns(recorded, "/__properties/run", name, None)[1] == [[value]]

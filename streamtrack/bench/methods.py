@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Self
 
@@ -75,8 +75,7 @@ class Streamtrack(Follower):
 
 def _streamtrack(name: str, title: str, values: dict[str, Any]) -> Method:
     settings = build_settings(values)
-    parameters = asdict(settings)
-    del parameters["recording"]
+    parameters = settings.model_dump(mode="json", exclude={"recording"})
     return Method(
         name,
         title,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import cv2
@@ -55,8 +55,7 @@ class PairMethod:
 def own_method(detector: str, descriptor: str, name: str = "") -> PairMethod:
     """streamtrack's own registration with a detector and a descriptor, defaults otherwise."""
     settings = build_settings({"features": {"detector": detector, "descriptor": descriptor}})
-    used = (settings.features, settings.matching, settings.registration)
-    parameters = {section.section: asdict(section) for section in used}
+    parameters = settings.model_dump(mode="json", include={"features", "matching", "registration"})
 
     def make() -> Callable[[Image, Image], Outcome]:
         registrar = PictureRegistrar(settings)

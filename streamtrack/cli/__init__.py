@@ -1,4 +1,4 @@
-"""The command line, one file a command.
+"""The command line, one file a command; the only package that talks to Typer.
 
 Heavy modules are imported where they are used, so that --help is instant.
 """
@@ -8,41 +8,60 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable
-from importlib import import_module
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any
 
-from streamtrack.cli.options import Command, Group, run_command
+import typer
+
+from streamtrack.cli.bench import bench_app
+from streamtrack.cli.devices import devices
+from streamtrack.cli.mosaic import mosaic
 from streamtrack.cli.process import hide_secrets
+from streamtrack.cli.tools import synth, view
+from streamtrack.cli.track import track
 from streamtrack.errors import StreamtrackError, UsageError
 
 _LIVE_ADDRESS = re.compile(r"(\S*:)?\d+")
 
+__all__ = ["app", "exit_on_error", "main", "with_live_address"]
 
-def _in(module: str, name: str) -> Callable[[], Command | Group]:
-    """Loads a command only when it is called, or listed."""
-
-    def load() -> Command | Group:
-        command: Command | Group = getattr(import_module(f"streamtrack.cli.{module}"), name)
-        return command
-
-    return load
+_COMMANDS: tuple[Callable[..., None], ...] = (track, mosaic, devices, synth, view)
 
 
-_PROGRAM = Group(
-    "Track objects in video, build mosaics of what the camera saw; see why in Rerun. "
-    "--version prints the version.",
-    {
-        "track": _in("track", "track"),
-        "mosaic": _in("mosaic", "mosaic"),
-        "devices": _in("devices", "devices"),
-        "synth": _in("tools", "synth"),
-        "view": _in("tools", "view"),
-        "bench": _in("bench", "bench"),
-    },
-)
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
 
-__all__ = ["exit_on_error", "main", "with_live_address"]
+        typer.echo(f"streamtrack {version('streamtrack')}")
+        raise typer.Exit
+
+
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Track objects in video, build mosaics of what the camera saw; see why in Rerun."""
+
+
+def _program(commands: Iterable[Callable[..., None]]) -> typer.Typer:
+    """The program with these commands and ``bench``."""
+    program = typer.Typer(
+        name="streamtrack",
+        help="Track objects in video, build mosaics of what the camera saw; see why in Rerun.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )
+    program.callback()(_common)
+    for command in commands:
+        program.command()(command)
+    program.add_typer(bench_app, name="bench")
+    return program
+
+
+app = _program(_COMMANDS)
 
 
 def main() -> None:
@@ -54,22 +73,18 @@ def main() -> None:
     # Its matrices are small: threads for them only wait for each other, at full speed.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     hide_secrets(sys.argv)
-    exit_on_error(lambda: _run(sys.argv[1:]))
-
-
-def _run(arguments: list[str]) -> int | None:
-    if arguments[:1] == ["--version"]:
-        from importlib.metadata import version
-
-        sys.stdout.write(f"streamtrack {version('streamtrack')}\n")
-        return 0
-    return run_command("streamtrack", _PROGRAM, with_live_address(arguments))
+    # Nothing plugs into pydantic here, and looking for it reads every installed package's metadata.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+    # Where one command is called, Typer need not work out the options of all the others.
+    called = [command for command in _COMMANDS if [command.__name__] == sys.argv[1:2]]
+    program = _program(called) if called else app
+    exit_on_error(lambda: program(with_live_address(sys.argv[1:]), standalone_mode=False))
 
 
 def with_live_address(arguments: list[str]) -> list[str]:
     """The arguments with ``--live`` given its default where no address follows it.
 
-    An option whose value may be left out would else take the source for it.
+    Typer knows no options whose value may be left out.
     """
     given: list[str] = []
     for place, argument in enumerate(arguments):
@@ -81,16 +96,22 @@ def with_live_address(arguments: list[str]) -> list[str]:
 
 def exit_on_error(run: Callable[[], Any]) -> None:
     """Call ``run``; exit with 2 for wrong usage and 1 for any failure, each said in one line."""
+    from typer.exceptions import Abort, TyperException
+
     try:
         result = run()
-        sys.stdout.flush()
         if isinstance(result, int):
             sys.exit(result)
+    except TyperException as error:
+        if not sys.argv[1:]:
+            sys.stderr.write(f"{error.format_message()}\n")  # the help
+            sys.exit(error.exit_code)
+        _fail(f"{error.format_message().rstrip('.')}; see streamtrack --help", error.exit_code)
     except UsageError as error:
         _fail(error, 2)
     except StreamtrackError as error:
         _fail(error, 1)
-    except KeyboardInterrupt:
+    except (Abort, KeyboardInterrupt):
         _fail("interrupted", 1)
     except BrokenPipeError:
         # Nobody reads our output any more; keep Python from complaining while it shuts down.

@@ -5,36 +5,48 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+import typer
+
 from streamtrack.cli.common import StopOnSignal, consoles, warnings_shown
-from streamtrack.cli.options import Group, Option
+
+bench_app = typer.Typer(
+    help="Measure accuracy and cost on sequences with known truth, against peers.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
 
 
+@bench_app.command("track")
 def bench_track(
-    quick: Annotated[bool, Option("--quick", help="A reduced set, in about a minute.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="A reduced set, in about a minute.")
+    ] = False,
     scenes: Annotated[
         str | None,
-        Option(help="Scenes of synthetic://, as blur,static; none for --pot alone."),
+        typer.Option(help="Scenes of synthetic://, as blur,static; none for --pot alone."),
     ] = None,
-    seeds: Annotated[str | None, Option(help="Seeds of each scene; default 1,2,3.")] = None,
+    seeds: Annotated[str | None, typer.Option(help="Seeds of each scene; default 1,2,3.")] = None,
     methods: Annotated[
         str | None,
-        Option(
+        typer.Option(
             help="streamtrack, harris-freak, sift, brisk, plane-tracker, lk-chain, prewarp-lk, "
             "prewarp-dis, csrt, kcf; default all."
         ),
     ] = None,
     frames: Annotated[
-        int | None, Option(least=3, help="Frames of each sequence; default 150.")
+        int | None, typer.Option(min=3, help="Frames of each sequence; default 150.")
     ] = None,
-    pot: Annotated[Path | None, Option(help="Folder of POT sequences, to be run as well.")] = None,
+    pot: Annotated[
+        Path | None, typer.Option(help="Folder of POT sequences, to be run as well.")
+    ] = None,
     json_path: Annotated[
-        Path | None, Option("--json", help="Everything that was measured, as JSON.")
+        Path | None, typer.Option("--json", help="Everything that was measured, as JSON.")
     ] = None,
-    plot: Annotated[Path | None, Option(help="Accuracy over cost, as PNG.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Accuracy over cost, as PNG.")] = None,
     verbose: Annotated[
-        bool, Option("--verbose", "-v", help="The factors of every method.")
+        bool, typer.Option("--verbose", "-v", help="The factors of every method.")
     ] = False,
-    quiet: Annotated[bool, Option("--quiet", "-q", help="Tell no progress.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Tell no progress.")] = False,
 ) -> None:
     """Track sequences with known truth by streamtrack and its peers, on the very same frames."""
     from streamtrack.bench.command import Request, run_request, tell_on
@@ -45,19 +57,22 @@ def bench_track(
         run_request(request, console, (lambda _line: None) if quiet else tell_on(errors), stop)
 
 
+@bench_app.command("mosaic")
 def bench_mosaic(
     pairs: Annotated[
         Path | None,
-        Option(
+        typer.Option(
             help="Folder of pairs with known homography, to be run as well: img1.png .. with "
             "H1to2p .., or NAMEA.png, NAMEB.png with NAME_model.txt (B to A)."
         ),
     ] = None,
-    quick: Annotated[bool, Option("--quick", help="A reduced set, in about a minute.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="A reduced set, in about a minute.")
+    ] = False,
     json_path: Annotated[
-        Path | None, Option("--json", help="Everything that was measured, as JSON.")
+        Path | None, typer.Option("--json", help="Everything that was measured, as JSON.")
     ] = None,
-    quiet: Annotated[bool, Option("--quiet", "-q", help="Tell no progress.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Tell no progress.")] = False,
 ) -> None:
     """Register pairs of pictures with known truth: every detector and descriptor, and peers."""
     from streamtrack.bench.command import tell_on
@@ -67,9 +82,3 @@ def bench_mosaic(
     request = PairRequest(pairs, quick, json_path)
     with warnings_shown(errors, quiet), StopOnSignal() as stop:
         run_pair_request(request, console, (lambda _line: None) if quiet else tell_on(errors), stop)
-
-
-bench = Group(
-    "Measure accuracy and cost where the truth is known, against peers.",
-    {"track": lambda: bench_track, "mosaic": lambda: bench_mosaic},
-)

@@ -22,21 +22,8 @@ DETECTORS = "harris, fast, agast, gftt, brisk, orb, sift, akaze"
 DESCRIPTORS = "freak, brisk, orb, teblid, sift, akaze"
 
 
-def say(text: str = "") -> None:
-    """A line on stdout."""
-    sys.stdout.write(f"{text}\n")
-
-
 def merged_settings(path: Path | None, flags: dict[str, Any]) -> Settings:
-    """Settings of a file and of the flags that were given (not None), which win."""
-    from streamtrack.settings import build_settings
-
-    return build_settings(merged_values(path, flags))
-
-
-def merged_values(path: Path | None, flags: dict[str, Any]) -> dict[str, Any]:
-    """The nested values that `merged_settings` makes settings of."""
-    from streamtrack.settings import read_settings_file
+    from streamtrack.settings import build_settings, read_settings_file
 
     values = read_settings_file(path) if path is not None else {}
     for section, value in flags.items():
@@ -47,7 +34,7 @@ def merged_values(path: Path | None, flags: dict[str, Any]) -> dict[str, Any]:
                 values[section] = {**in_file, **given}
         elif value is not None:
             values[section] = value
-    return values
+    return build_settings(values)
 
 
 def default_recording(source: str, *, is_series: bool) -> Path:

@@ -6,8 +6,9 @@ import json
 import shlex
 from typing import TYPE_CHECKING, Annotated
 
-from streamtrack.cli.common import consoles, say
-from streamtrack.cli.options import Option
+import typer
+
+from streamtrack.cli.common import consoles
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -16,9 +17,9 @@ if TYPE_CHECKING:
 
 
 def devices(
-    as_json: Annotated[bool, Option("--json", help="As JSON, with controls.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="As JSON, with controls.")] = False,
     controls: Annotated[
-        bool, Option("--controls", help="List what control.NAME=VALUE can set, too.")
+        bool, typer.Option("--controls", help="List what control.NAME=VALUE can set, too.")
     ] = False,
 ) -> None:
     """List the cameras of this machine and how to address them."""
@@ -26,17 +27,17 @@ def devices(
 
     found = find_devices()
     if as_json:
-        say(json.dumps(to_json(found), indent=2))
+        typer.echo(json.dumps(to_json(found), indent=2))
         return
     console, _ = consoles()
     if not found:
-        say(
+        typer.echo(
             "no cameras found: plug one in; it appears as /dev/video0 "
             "(in a container, pass it in: --device /dev/video0)"
         )
     for number, device in enumerate(found):
         if number:
-            say()
+            typer.echo()
         _print_device(console, device, controls)
 
 
@@ -44,15 +45,15 @@ def _print_device(console: Console, device: Device, with_controls: bool) -> None
     from streamtrack.devices import sizes_and_rates
 
     origin = ", ".join(filter(None, [device.driver, device.bus]))
-    say(f"{device.path}  {device.name}" + (f" ({origin})" if origin else ""))
+    typer.echo(f"{device.path}  {device.name}" + (f" ({origin})" if origin else ""))
     if device.stable_path is not None:
-        say(f"  always {device.stable_path}")
+        typer.echo(f"  always {device.stable_path}")
     if device.problem:
-        say(f"  problem: {device.problem}")
-    say(f"  use    {shlex.quote(device.uri)}")
+        typer.echo(f"  problem: {device.problem}")
+    typer.echo(f"  use    {shlex.quote(device.uri)}")
     _print_table(console, ("format", "size", "fps"), sizes_and_rates(device))
     if device.unreadable_formats:
-        say(f"  also {', '.join(device.unreadable_formats)}, which are not read")
+        typer.echo(f"  also {', '.join(device.unreadable_formats)}, which are not read")
     if with_controls:
         rows = [
             (f"control.{control.name}", control.choices, f"default {control.default}")
@@ -77,4 +78,4 @@ def _print_table(
     with console.capture() as capture:
         console.print(table)
     for line in capture.get().splitlines():
-        say(f"  {line.rstrip()}")
+        typer.echo(f"  {line.rstrip()}")

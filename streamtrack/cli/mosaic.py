@@ -6,13 +6,14 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import typer
+
 from streamtrack.cli.common import (
     DESCRIPTORS,
     DETECTORS,
     StopOnSignal,
     merged_settings,
 )
-from streamtrack.cli.options import Argument, Option
 from streamtrack.cli.plain import plain_summary, stage_progress_for, warnings_on_stderr
 from streamtrack.errors import UsageError
 
@@ -24,64 +25,68 @@ if TYPE_CHECKING:
 def mosaic(
     inputs: Annotated[
         list[str],
-        Argument(
-            metavar="INPUT",
+        typer.Argument(
+            metavar="INPUT...",
             help="Pictures, folders or globs of them; or one stream: video file, /dev/videoN, "
             "rtsp://..., synthetic://...",
         ),
     ],
     output: Annotated[
         Path | None,
-        Option("--output", "-o", help="The mosaic: .png, .jpg, .tif, .webp or .bmp."),
+        typer.Option("--output", "-o", help="The mosaic: .png, .jpg, .tif, .webp or .bmp."),
     ] = None,
-    detector: Annotated[str | None, Option(help=f"{DETECTORS}.")] = None,
-    threshold: Annotated[float | None, Option(help="The detector's own threshold.")] = None,
-    descriptor: Annotated[str | None, Option(help=f"{DESCRIPTORS}.")] = None,
+    detector: Annotated[str | None, typer.Option(help=f"{DETECTORS}.")] = None,
+    threshold: Annotated[float | None, typer.Option(help="The detector's own threshold.")] = None,
+    descriptor: Annotated[str | None, typer.Option(help=f"{DESCRIPTORS}.")] = None,
     model: Annotated[
         str | None,
-        Option(help="auto, homography, affine, similarity or translation."),
+        typer.Option(help="auto, homography, affine, similarity or translation."),
     ] = None,
     warping: Annotated[
-        str | None, Option(help="Backward: nearest, linear, cubic or lanczos.")
+        str | None, typer.Option(help="Backward: nearest, linear, cubic or lanczos.")
     ] = None,
-    blending: Annotated[str | None, Option(help="none, average, feather or multiband.")] = None,
+    blending: Annotated[
+        str | None, typer.Option(help="none, average, feather or multiband.")
+    ] = None,
     projection: Annotated[
-        str | None, Option(help="auto, planar, cylindrical or spherical.")
+        str | None, typer.Option(help="auto, planar, cylindrical or spherical.")
     ] = None,
     max_megapixels: Annotated[
-        float | None, Option(help="A larger mosaic is scaled down to this.")
+        float | None, typer.Option(help="A larger mosaic is scaled down to this.")
     ] = None,
     max_memory: Annotated[
-        float | None, Option(help="MB for pictures and canvas; more goes by way of the disk.")
+        float | None, typer.Option(help="MB for pictures and canvas; more goes by way of the disk.")
     ] = None,
     truth: Annotated[
         Path | None,
-        Option(help="Text with the true homography, first picture to second: nine numbers."),
+        typer.Option(help="Text with the true homography, first picture to second: nine numbers."),
     ] = None,
-    poses: Annotated[Path | None, Option(help="CSV of where each picture lies.")] = None,
-    summary: Annotated[Path | None, Option(help="Summary as JSON.")] = None,
-    record: Annotated[Path | None, Option(help="Recording for the Rerun viewer (.rrd).")] = None,
-    no_record: Annotated[bool, Option("--no-record", help="Make no recording.")] = False,
+    poses: Annotated[Path | None, typer.Option(help="CSV of where each picture lies.")] = None,
+    summary: Annotated[Path | None, typer.Option(help="Summary as JSON.")] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="Recording for the Rerun viewer (.rrd).")
+    ] = None,
+    no_record: Annotated[bool, typer.Option("--no-record", help="Make no recording.")] = False,
     live: Annotated[
         str | None,
-        Option(
+        typer.Option(
             metavar="[[ADDRESS:]PORT]",
             help="Show a stream's mosaic as it grows, in a browser or Rerun viewer: at "
             "127.0.0.1:9876 if no address follows.",
         ),
     ] = None,
     max_fps: Annotated[
-        float | None, Option(help="Leave out pictures of a live source beyond this rate.")
+        float | None, typer.Option(help="Leave out pictures of a live source beyond this rate.")
     ] = None,
     retries: Annotated[
         int | None,
-        Option(least=0, help="Openings of a live source in a row; default for ever."),
+        typer.Option(min=0, help="Openings of a live source in a row; default for ever."),
     ] = None,
-    settings: Annotated[Path | None, Option(help="Settings as TOML; flags win.")] = None,
-    start: Annotated[int, Option(least=0, help="First frame or picture, from 0.")] = 0,
-    step: Annotated[int, Option(least=1, help="Use every n-th.")] = 1,
-    frames: Annotated[int | None, Option(least=1, help="Use at most n.")] = None,
-    quiet: Annotated[bool, Option("--quiet", "-q", help="Print errors only.")] = False,
+    settings: Annotated[Path | None, typer.Option(help="Settings as TOML; flags win.")] = None,
+    start: Annotated[int, typer.Option(min=0, help="First frame or picture, from 0.")] = 0,
+    step: Annotated[int, typer.Option(min=1, help="Use every n-th.")] = 1,
+    frames: Annotated[int | None, typer.Option(min=1, help="Use at most n.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
 ) -> None:
     """Join pictures, or the frames of a stream, into one picture, and say how well they fit."""
     if not any((output, poses, summary, record, live is not None)):

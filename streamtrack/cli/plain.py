@@ -6,7 +6,7 @@ Importing Rich would cost more than joining two pictures does.
 from __future__ import annotations
 
 import logging
-import os
+import shutil
 import sys
 import time
 from collections.abc import Iterator
@@ -56,7 +56,7 @@ class _Lines:
         of = "" if self._total is None else f" of {self._total}"
         line = f"{self._stage} {self._done}{of} {text}".rstrip()
         if self._redraws:
-            columns = os.get_terminal_size(self._stream.fileno()).columns or 80
+            columns = shutil.get_terminal_size().columns
             self._stream.write(f"\r{line[: columns - 1]}\x1b[K")
         else:
             self._stream.write(f"{line}\n")

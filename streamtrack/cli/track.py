@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
+
+import typer
 
 from streamtrack.cli.common import (
     DESCRIPTORS,
@@ -12,19 +13,18 @@ from streamtrack.cli.common import (
     StopOnSignal,
     consoles,
     default_recording,
-    merged_values,
+    merged_settings,
     print_summary,
     progress_for,
     warnings_shown,
 )
-from streamtrack.cli.options import Argument, Option
 from streamtrack.errors import UsageError
 
 
 def track(
     source: Annotated[
         str,
-        Argument(
+        typer.Argument(
             metavar="SOURCE",
             help="Video file, folder or glob of pictures, /dev/videoN (see streamtrack devices), "
             "v4l2://, rtsp://, http(s)://, udp://, - for standard input, or "
@@ -33,18 +33,18 @@ def track(
     ],
     target: Annotated[
         list[str],
-        Option(
+        typer.Option(
             help="[NAME=]x,y,w,h or [NAME=]x1,y1,...,x4,y4 in pixels of the first frame, or "
             "[NAME=]PICTURE[@region of it] to search for, or auto: all that moves. May repeat.",
         ),
     ],
     method: Annotated[
         str | None,
-        Option(help="hybrid (predict, warp back, flow) or detect (every frame by itself)."),
+        typer.Option(help="hybrid (predict, warp back, flow) or detect (every frame by itself)."),
     ] = None,
     budget: Annotated[
         float | None,
-        Option(
+        typer.Option(
             metavar="MS",
             help="Keep the time a frame near MS by doing less, in four stated levels; of a live "
             "source from when the frame lay ready. Results then depend on the machine's speed.",
@@ -52,7 +52,7 @@ def track(
     ] = None,
     camera: Annotated[
         str | None,
-        Option(
+        typer.Option(
             help="fixed (watched, and said if it is not), moving, or auto: finds out, also when it "
             "changes. Default fixed; auto with --target auto and where --mosaic, --stabilize, "
             "--poses, --scale or --ground ask for the world.",
@@ -60,7 +60,7 @@ def track(
     ] = None,
     scale: Annotated[
         float | None,
-        Option(
+        typer.Option(
             metavar="PX_PER_UNIT",
             help="World pixels in one unit (metre ...): adds ground_x, ground_y and "
             "speed_units_s to --output.",
@@ -68,52 +68,54 @@ def track(
     ] = None,
     ground: Annotated[
         list[str] | None,
-        Option(
+        typer.Option(
             metavar="x,y=X,Y",
             help="Where a pixel of the first frame lies on the ground, in units; four or more, "
             "fitted by least squares. Adds the same columns.",
         ),
     ] = None,
-    detector: Annotated[str | None, Option(help=f"{DETECTORS}.")] = None,
-    threshold: Annotated[float | None, Option(help="The detector's own threshold.")] = None,
-    descriptor: Annotated[str | None, Option(help=f"{DESCRIPTORS}.")] = None,
+    detector: Annotated[str | None, typer.Option(help=f"{DETECTORS}.")] = None,
+    threshold: Annotated[float | None, typer.Option(help="The detector's own threshold.")] = None,
+    descriptor: Annotated[str | None, typer.Option(help=f"{DESCRIPTORS}.")] = None,
     model: Annotated[
         str | None,
-        Option(help="auto, homography, affine, similarity or translation."),
+        typer.Option(help="auto, homography, affine, similarity or translation."),
     ] = None,
     record: Annotated[
         Path | None,
-        Option(help="Recording; default recordings/<source>-<start time>.rrd."),
+        typer.Option(help="Recording; default recordings/<source>-<start time>.rrd."),
     ] = None,
-    no_record: Annotated[bool, Option("--no-record", help="Make no recording.")] = False,
+    no_record: Annotated[bool, typer.Option("--no-record", help="Make no recording.")] = False,
     record_video: Annotated[
         str | None,
-        Option(help="Picture in the recording: auto (copy packets), jpeg, av1 or none."),
+        typer.Option(help="Picture in the recording: auto (copy packets), jpeg, av1 or none."),
     ] = None,
     output: Annotated[
         Path | None,
-        Option(help="Table of tracks: .csv, .jsonl, .parquet, or .txt (MOT)."),
+        typer.Option(help="Table of tracks: .csv, .jsonl, .parquet, or .txt (MOT)."),
     ] = None,
-    poses: Annotated[Path | None, Option(help="CSV of the camera's poses.")] = None,
-    video: Annotated[Path | None, Option(help="Annotated copy: .mp4, .mkv, .webm, .avi.")] = None,
+    poses: Annotated[Path | None, typer.Option(help="CSV of the camera's poses.")] = None,
+    video: Annotated[
+        Path | None, typer.Option(help="Annotated copy: .mp4, .mkv, .webm, .avi.")
+    ] = None,
     mosaic: Annotated[
         Path | None,
-        Option(help="What the camera saw, without the targets: .png, .jpg, .tif."),
+        typer.Option(help="What the camera saw, without the targets: .png, .jpg, .tif."),
     ] = None,
     stabilize: Annotated[
         Path | None,
-        Option(help="The video held still: .mp4, .mkv, .webm, .avi."),
+        typer.Option(help="The video held still: .mp4, .mkv, .webm, .avi."),
     ] = None,
     stabilize_path: Annotated[
         str | None,
-        Option(
+        typer.Option(
             help="smooth (default): follows the camera's mean motion, cropped by 6 per cent a "
             "side; world: the place that the first frame showed.",
         ),
     ] = None,
     live: Annotated[
         str | None,
-        Option(
+        typer.Option(
             metavar="[[ADDRESS:]PORT]",
             help="Show the run as it goes, in a browser or Rerun viewer: at 127.0.0.1:9876 if no "
             "address follows.",
@@ -121,35 +123,35 @@ def track(
     ] = None,
     rotate: Annotated[
         str | None,
-        Option(help="Begin a new recording after 100MB, 10min, or both: 100MB|10min."),
+        typer.Option(help="Begin a new recording after 100MB, 10min, or both: 100MB|10min."),
     ] = None,
     keep: Annotated[
-        str | None, Option(help="Remove the oldest of them beyond 2GB, 7d, or both.")
+        str | None, typer.Option(help="Remove the oldest of them beyond 2GB, 7d, or both.")
     ] = None,
     max_width: Annotated[
         int | None,
-        Option(
+        typer.Option(
             metavar="PX",
             help="Work on wider pictures at this width; results stay in pixels of the source.",
         ),
     ] = None,
     max_fps: Annotated[
-        float | None, Option(help="Leave out pictures of a live source beyond this rate.")
+        float | None, typer.Option(help="Leave out pictures of a live source beyond this rate.")
     ] = None,
     retries: Annotated[
         int | None,
-        Option(least=0, help="Openings of a live source in a row; default for ever."),
+        typer.Option(min=0, help="Openings of a live source in a row; default for ever."),
     ] = None,
-    summary: Annotated[Path | None, Option(help="Summary as JSON.")] = None,
-    settings: Annotated[Path | None, Option(help="Settings as TOML; flags win.")] = None,
-    start: Annotated[int, Option(least=0, help="First frame, counted from 0.")] = 0,
-    step: Annotated[int, Option(least=1, help="Use every n-th frame.")] = 1,
-    frames: Annotated[int | None, Option(least=1, help="Use at most n frames.")] = None,
-    quiet: Annotated[bool, Option("--quiet", "-q", help="Print errors only.")] = False,
+    summary: Annotated[Path | None, typer.Option(help="Summary as JSON.")] = None,
+    settings: Annotated[Path | None, typer.Option(help="Settings as TOML; flags win.")] = None,
+    start: Annotated[int, typer.Option(min=0, help="First frame, counted from 0.")] = 0,
+    step: Annotated[int, typer.Option(min=1, help="Use every n-th frame.")] = 1,
+    frames: Annotated[int | None, typer.Option(min=1, help="Use at most n frames.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
 ) -> None:
     """Follow targets through a video and write a recording, tables and a summary."""
     from streamtrack.ground import make_ground, parse_ground
-    from streamtrack.settings import WorldSettings, build_settings
+    from streamtrack.settings import WorldSettings
     from streamtrack.targets import auto_target, parse_targets
 
     known = parse_ground(ground) if ground else None
@@ -157,7 +159,7 @@ def track(
         raise UsageError("--stabilize-path says how: give --stabilize FILE.mp4 as well")
     if scale is not None and known is not None:
         raise UsageError("--scale and --ground contradict each other: give one of them")
-    values = merged_values(
+    chosen = merged_settings(
         settings,
         {
             "features": {"detector": detector, "threshold": threshold, "descriptor": descriptor},
@@ -171,13 +173,12 @@ def track(
             "live": {"max_fps": max_fps, "retries": retries},
         },
     )
-    chosen = build_settings(values)
     make_ground(chosen.world)  # what is wrong with the known points is said at once
     targets = parse_targets(target)
     finds_targets = auto_target(targets) is not None  # against the background, wherever that goes
     is_world_wanted = bool(mosaic or poses or stabilize or chosen.world != WorldSettings())
-    if (finds_targets or is_world_wanted) and "camera" not in values:
-        chosen = replace(chosen, camera="auto")
+    if (finds_targets or is_world_wanted) and "camera" not in chosen.model_fields_set:
+        chosen = chosen.model_copy(update={"camera": "auto"})
     from streamtrack.job import TrackJob, run_track
     from streamtrack.recording.live_server import parse_live
     from streamtrack.watching import Outputs

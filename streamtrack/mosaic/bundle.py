@@ -17,7 +17,6 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from streamtrack.median import median
 from streamtrack.types import Mask, Model
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
@@ -171,7 +170,7 @@ class _Rejection:
 
     def _tolerance(self, errors: Doubles) -> float:
         """RMS of a link that counts half: three times what links usually have."""
-        return 3 * max(_MIN_TOLERANCE_PX, median(self._rms(errors)))
+        return 3 * max(_MIN_TOLERANCE_PX, float(np.median(self._rms(errors))))
 
     def weights(self, errors: Doubles) -> Doubles:
         """What each link (L,) counts, 0..1."""
@@ -198,7 +197,7 @@ def estimated_noise_px(problem: Problem, errors: Doubles, is_used: Mask | None =
     if not is_pair.any():
         return MIN_NOISE_PX
     alone = errors[is_pair] * np.sqrt(problem.counts[is_pair])
-    return max(MIN_NOISE_PX, median(alone) / 1.1774)
+    return max(MIN_NOISE_PX, float(np.median(alone)) / 1.1774)
 
 
 def _weights(problem: Problem, poses: Doubles, errors: Doubles, rejection: _Rejection) -> _Weights:

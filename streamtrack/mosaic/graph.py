@@ -11,7 +11,6 @@ import numpy as np
 from streamtrack import geometry
 from streamtrack.evaluation import symmetric_transfer_rmse
 from streamtrack.fitting import fit, fit_robustly, transfer_errors
-from streamtrack.median import median
 from streamtrack.mosaic.types import Link
 from streamtrack.types import Matrix, Model, Points, Registration, Size, Verdict
 
@@ -84,7 +83,7 @@ def _loop_error(a_from_a: Matrix, points: Points, size_wh: Size) -> float:
     moved = geometry.transform_points(a_from_a, points)
     if not np.all(np.isfinite(moved)):
         return float("inf")
-    return median(np.linalg.norm(moved - points, axis=1)) / float(np.hypot(*size_wh))
+    return float(np.median(np.linalg.norm(moved - points, axis=1)) / np.hypot(*size_wh))
 
 
 def well_supported(link: Link) -> Link | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import struct
+import tempfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -223,8 +224,6 @@ class _WholeWriter:
         self._file = file
         self._shape = size_wh[1], size_wh[0], channels
         self._suffix = suffix
-        import tempfile
-
         # Plain writes, then a map to read from: a map that is written to dies of a full disk.
         self._rows = tempfile.TemporaryFile()  # noqa: SIM115 - closed in finish, unnamed anyway
 

@@ -14,7 +14,7 @@ The cheap steps come first, so that pictures which share nothing are refused ear
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -29,7 +29,6 @@ from streamtrack.fitting import (
     gauss_newton_step,
     transfer_errors,
 )
-from streamtrack.median import median
 from streamtrack.mosaic import direct
 from streamtrack.mosaic.agreement import measure_agreement
 from streamtrack.mosaic.ambiguity import is_ambiguous
@@ -164,7 +163,9 @@ class PictureRegistrar:
         Which pairs agree at all is judged on the grid, where little is left between them.
         """
         rules = self._settings.registration
-        on_grid = replace(rules, inlier_threshold_px=_TRACKED_PX, model="homography")
+        on_grid = rules.model_copy(
+            update={"inlier_threshold_px": _TRACKED_PX, "model": Model.HOMOGRAPHY.value}
+        )
         is_inlier = robust_inliers(ours, theirs, on_grid)
         model = Model.HOMOGRAPHY if rules.model == "auto" else Model(rules.model)
         if np.count_nonzero(is_inlier) < max(_MIN_TRACKED, rules.min_inliers):
@@ -185,7 +186,7 @@ class PictureRegistrar:
         overlap = rendered_again(fit.overlap, far, fit.far_from_near)
         errors = transfer_errors(fit.far_from_near, fit.near_points, fit.far_points)
         far_px = geometry.local_scale(overlap.far_from_grid, np.array(overlap.size_wh) / 2)
-        if median(errors) > _FLAT_PX * far_px:
+        if float(np.median(errors)) > _FLAT_PX * far_px:
             return fit.far_from_near, overlap
         found = direct.align(overlap.near, overlap.far, overlap.covered, np.eye(3), fit.model)
         if found is None:
@@ -248,7 +249,7 @@ def _fit_evenly(model: Model, start: Matrix, a: Points, b: Points, threshold_px:
     near = errors[errors < threshold_px]
     if len(near) < _MIN_TRACKED:
         return start
-    cut = min(max(_EVEN_WIDTH * median(near), 0.25), threshold_px)
+    cut = min(max(_EVEN_WIDTH * float(np.median(near)), 0.25), threshold_px)
     weights = np.where(errors < cut, (1 - (errors / cut) ** 2) ** 2, 0.0)
     used = weights > 0
     if np.count_nonzero(used) < _MIN_TRACKED:

@@ -20,7 +20,6 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.median import median
 from streamtrack.mosaic.types import Link
 from streamtrack.types import Matrix, Size
 
@@ -143,8 +142,8 @@ def _median_misfit(focal: float, links: Sequence[Link], sizes: Mapping[int, Size
         error = geometry.transform_points(turned, points) - geometry.transform_points(
             link.b_from_a, points
         )
-        errors.append(median(np.linalg.norm(error, axis=1)))
-    return median(np.array(errors))
+        errors.append(float(np.median(np.linalg.norm(error, axis=1))))
+    return float(np.median(errors))
 
 
 # -- adjustment ---------------------------------------------------------------------------------
@@ -185,7 +184,7 @@ def adjust_rotations(
     errors = [_lengths(_residuals(state, scales, p)[0]) for p in pairs]
     joined = np.concatenate(errors)
     near = joined[joined < 3 * noise_px]
-    medians = dict(zip(map(id, used), (median(e) for e in errors), strict=True))
+    medians = dict(zip(map(id, used), (float(np.median(e)) for e in errors), strict=True))
     to_anchor = state.rotations[row[anchor]].T
     return Rotations(
         {picture: to_anchor @ state.rotations[i] for picture, i in row.items()},
@@ -338,7 +337,7 @@ def _minimise(
 def _noise(state: _State, scales: Doubles, pairs: Sequence[_Pairs]) -> float:
     """Standard deviation of one coordinate, from the median length of all residuals."""
     lengths = np.concatenate([_lengths(_residuals(state, scales, p)[0]) for p in pairs])
-    return max(_MIN_NOISE_PX, median(lengths) / 1.1774)
+    return max(_MIN_NOISE_PX, float(np.median(lengths)) / 1.1774)
 
 
 def _cost(state: _State, scales: Doubles, pairs: Sequence[_Pairs], noise_px: float) -> float:

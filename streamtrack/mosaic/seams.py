@@ -18,7 +18,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from streamtrack.median import median
 from streamtrack.mosaic.projection import Box
 from streamtrack.types import Image, Size
 
@@ -109,7 +108,7 @@ def _give_away_things(
 
     It goes to the side whose pixels it touches or, free all round, to the nearer one.
     """
-    typical = median(cost[free > 0]) if free.any() else 0.0
+    typical = float(np.median(cost[free > 0])) if free.any() else 0.0
     things = np.asarray((cost > max(_MIN_DIFFERENCE, _MANIFOLD * typical)) & (free > 0), np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(things, connectivity=8)
     most = _MOST_OF_STRIP * np.count_nonzero(free)
@@ -134,9 +133,8 @@ def _flooded(cost: Image, old: Image, new: Image, free: Image) -> tuple[Image, I
     x0, x1 = max(0, int(xs.min()) - 1), int(xs.max()) + 2
     part = slice(y0, y1), slice(x0, x1)
     cost, old, grown, left = cost[part], old[part].copy(), new[part].copy(), free[part].copy()
-    ordered = np.sort(cost[left > 0])[::-1]
-    last_of_share = np.linspace(0, len(ordered) - 1, _LEVELS + 1).round().astype(np.intp)[1:]
-    for level in sorted(set(ordered[last_of_share].tolist()), reverse=True):
+    levels = np.unique(np.quantile(cost[left > 0], np.linspace(1, 0, _LEVELS + 1)[1:]))[::-1]
+    for level in levels:
         high = np.asarray(cost >= level, np.uint8) * np.uint8(255)
         allowed = cv2.bitwise_and(left, high)
         for _ in range(_STEPS):

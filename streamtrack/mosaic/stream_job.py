@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 from streamtrack.camera.keyframes import KeyframeGraph
 from streamtrack.camera.moving import CameraEstimator
@@ -26,7 +25,7 @@ def run_stream_mosaic(
     """
     if job.truth is not None:
         raise UsageError("--truth is for two pictures, and this is a stream: leave it out")
-    settings = replace(job.settings, camera="moving", max_width=None)
+    settings = job.settings.model_copy(update={"camera": "moving", "max_width": None})
     outputs = Outputs(
         record=job.outputs.record,
         poses=job.outputs.poses,

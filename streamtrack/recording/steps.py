@@ -6,12 +6,10 @@ records whatever is said once, and after it states are said again.
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
@@ -215,7 +213,7 @@ class StepLog:
                 width=source.size_wh[0],
                 height=source.size_wh[1],
                 rate_hz=math.nan if source.rate_hz is None else source.rate_hz,
-                settings=json.dumps(asdict(settings)),
+                settings=settings.model_dump_json(),
             ),
         )
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import glob
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,7 +86,7 @@ def _stream(
     name = redacted(uri)
     if uri == STDIN:
         name = "standard input"
-        settings = replace(settings, retries=0)  # It cannot be opened again.
+        settings = settings.model_copy(update={"retries": 0})  # It cannot be opened again.
 
     def opener(is_stopping: Callable[[], bool]) -> NetworkCapture:
         return NetworkCapture(uri, settings, with_packets=with_packets, should_stop=is_stopping)

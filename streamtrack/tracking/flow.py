@@ -235,7 +235,7 @@ class FlowAligner:
 
         The model is that of the remaining motion: what the guess had of richer models stays.
         """
-        settings = replace(self._settings, inlier_threshold_px=_INLIER_PX)
+        settings = self._settings.model_copy(update={"inlier_threshold_px": _INLIER_PX})
         found = register(
             patch.points[warp.visible][is_like],
             moved[is_like],
@@ -246,11 +246,11 @@ class FlowAligner:
         )
         # Not for a target that comes back: what agrees so loosely would be thin evidence.
         if settings.model == "auto" and prior is not None and _looks_bent(is_like, found):
-            loose = replace(settings, inlier_threshold_px=_BENT_INLIER_PX, model="similarity")
+            loose = {"inlier_threshold_px": _BENT_INLIER_PX, "model": Model.SIMILARITY.value}
             found = register(
                 patch.points[warp.visible][is_like],
                 moved[is_like],
-                loose,
+                settings.model_copy(update=loose),
                 geometry.transform_points(patch.patch_from_template, self._template.quad),
                 (2 * _SEARCH_PX) ** 2,
                 effort,

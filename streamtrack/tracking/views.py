@@ -18,7 +18,7 @@ from streamtrack.frame_view import FrameView
 from streamtrack.settings import RegistrationSettings
 from streamtrack.tracking.flow import Alignment, FlowAligner, Hope, agreeing_share
 from streamtrack.tracking.template import MIN_FLOW_POINTS, Template, make_passing_patches
-from streamtrack.types import Image, Matrix, Points
+from streamtrack.types import Image, Matrix, Model, Points
 
 MIN_VIEW_SHARE = 0.6
 """Share of a recent view's points that must agree."""
@@ -43,7 +43,7 @@ class RecentViews:
     def __init__(self, template: Template, settings: RegistrationSettings) -> None:
         self._template = template
         self._flat_settings = settings
-        self._settings = replace(settings, model="similarity")
+        self._settings = settings.model_copy(update={"model": Model.SIMILARITY.value})
         self._newest: _Sight | None = None
         self._in_use: _Sight | None = None
         self._aligner: FlowAligner | None = None

@@ -181,6 +181,10 @@ class FullSizeGraph:
     def edges(self) -> Iterable[KeyframeEdge]:
         return self._graph.edges
 
+    def keyframe_of(self, index: int) -> int | None:
+        """The keyframe that a frame moves with."""
+        return self._graph.keyframe_of(index)
+
     def world_from_frame(self, index: int) -> Matrix | None:
         pose = self._graph.world_from_frame(index)
         return None if pose is None else self._full(pose)

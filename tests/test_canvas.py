@@ -18,11 +18,10 @@ from streamtrack.mosaic import bands, gains, painting, picture_files
 from streamtrack.mosaic.canvas import Canvas
 from streamtrack.mosaic.consensus import Chooser
 from streamtrack.mosaic.coverage import CellGrid, Footprint, footprint
-from streamtrack.mosaic.painting import Patch
 from streamtrack.mosaic.picture_files import open_picture
 from streamtrack.mosaic.spill import SpillFile
 from streamtrack.mosaic.tiles import TILE_BYTES, tile_box, tile_keys
-from streamtrack.types import Image
+from streamtrack.types import Image, Matrix
 
 
 def bgrw(image: Image, weight: int | Image = 200) -> Image:
@@ -193,37 +192,54 @@ def test_the_weight_falls_from_the_centre(size_wh: tuple[int, int]) -> None:
         assert (np.diff(middle[: size_wh[0] // 2]) >= 0).all()
 
 
-def test_the_heavier_frame_wins_and_empty_places_are_filled(make_picture: MakePicture) -> None:
+def painted(canvas: Canvas, frame: Image, canvas_from_frame: Matrix) -> painting.Comparison:
+    """The frame painted into the canvas as the stream does it."""
+    box = painting.box_of(canvas_from_frame, (frame.shape[1], frame.shape[0]))
+    small = painting.shrunk(frame, (), canvas_from_frame, 1.0, box)
+    seen = painting.compared(box, painting.quartered(canvas.read(box)), small)
+    for part in seen.parts():
+        new = painting.warped(painting.weighted(frame), canvas_from_frame, part)
+        canvas.write(part, painting.paint(canvas.read(part), new, seen.differs_in(part)))
+    return seen
+
+
+def test_empty_places_are_filled_and_the_heavier_frame_wins_next_to_them(
+    tmp_path: Path, make_picture: MakePicture
+) -> None:
     picture = make_picture(3, (400, 200))
-    frame = painting.weighted(picture[:, :240])
-    other = painting.weighted(picture[:, 160:])
-    box = (0, 0, 400, 200)
-    old = painting.warped(frame, np.eye(3), box)
-    new = painting.warped(other, geometry.translation(160, 0), box)
-    done = painting.paint(Patch(box, old), new)
-    assert done.patch is not None and done.differs is None
-    assert done.overlap == pytest.approx(80 * 200, rel=0.05)
-    result = old.copy()
-    x0, y0, x1, y1 = done.patch.box
-    result[y0:y1, x0:x1] = done.patch.pixels
-    inside = result[2:-2, 2:-2]
-    np.testing.assert_array_equal(inside[..., 0], picture[2:-2, 2:-2])
-    np.testing.assert_array_equal(result[100, :190], old[100, :190])  # shown better before
+    canvas = Canvas(100 * TILE_BYTES, SpillFile(tmp_path))
+    painted(canvas, picture[:, :240], np.eye(3))
+    before = canvas.read((0, 0, 400, 200))
+    seen = painted(canvas, picture[:, 160:], geometry.translation(160, 0))
+    assert not seen.differs.any()
+    covered = sum((x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in seen.parts())
+    assert 160 * 200 < covered < 1.25 * 160 * 200  # of 240 * 200: what is new, and a border
+    result = canvas.read((0, 0, 400, 200))
+    np.testing.assert_array_equal(result[2:-2, 2:-2, 0], picture[2:-2, 2:-2])
+    np.testing.assert_array_equal(result[:, :190], before[:, :190])
+    assert (result[100, 232:240, 3] > before[100, 232:240, 3]).all()  # the other's very edge
 
 
-def test_where_they_differ_what_stands_stays(make_picture: MakePicture) -> None:
+def test_nothing_new_is_nothing_painted(tmp_path: Path, make_picture: MakePicture) -> None:
+    picture = make_picture(3, (320, 240))
+    canvas = Canvas(100 * TILE_BYTES, SpillFile(tmp_path))
+    painted(canvas, picture, np.eye(3))
+    assert painted(canvas, picture[60:180, 80:240], geometry.translation(80, 60)).parts() == []
+
+
+def test_where_they_differ_what_stands_stays(tmp_path: Path, make_picture: MakePicture) -> None:
     picture = make_picture(4, (320, 240))
     changed = picture.copy()
     changed[80:130, 100:160] = 245
-    old = bgrw(picture, 100)
-    done = painting.paint(Patch((0, 0, 320, 240), old), bgrw(changed, 200))
-    assert done.patch is not None and done.differs is not None
-    assert 0.5 * 3000 < done.contested < 3 * 3000
-    x0, y0, x1, y1 = done.patch.box
-    result = old.copy()
-    result[y0:y1, x0:x1] = done.patch.pixels
-    np.testing.assert_array_equal(result[..., 0], picture)
-    assert (result[100, 120, 3], result[20, 20, 3]) == (100, 200)
+    canvas = Canvas(100 * TILE_BYTES, SpillFile(tmp_path))
+    painted(canvas, picture, np.eye(3))
+    before = canvas.read((0, 0, 320, 240))
+    seen = painted(canvas, changed, np.eye(3))
+    assert 0.5 * 3000 < 16 * np.count_nonzero(seen.differs) < 3 * 3000
+    np.testing.assert_array_equal(canvas.read((0, 0, 320, 240)), before)
+    over = painting.paint(before, bgrw(changed, 255), seen.differs)
+    np.testing.assert_array_equal(over[..., 0][82:128, 102:158], picture[82:128, 102:158])
+    assert over[20, 20, 3] == 255
 
 
 def test_targets_have_no_weight() -> None:

@@ -66,6 +66,9 @@ class Graph:
     def world_from_frame(self, index):
         return translation(self.shift, self.shift) @ pose(index)
 
+    def keyframe_of(self, index):
+        return None
+
     def move(self, shift):
         self.revision += shift != self.shift
         self.shift = shift

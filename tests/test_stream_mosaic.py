@@ -246,6 +246,9 @@ class Graph:
     def world_from_frame(self, index: int) -> Matrix | None:
         return self.poses.get(index)
 
+    def keyframe_of(self, index: int) -> int | None:
+        return None
+
 
 def test_moved_keyframes_are_painted_anew(tmp_path: Path, make_picture: MakePicture) -> None:
     """As after a loop closure: poses had drifted, then they are put right."""

@@ -153,6 +153,11 @@ class KeyframeGraph:
         world_from_keyframe = self._keyframes[frame.keyframe].world_from_keyframe
         return geometry.normalized(world_from_keyframe @ frame.keyframe_from_frame)
 
+    def keyframe_of(self, index: int) -> int | None:
+        """The keyframe against which a frame was measured."""
+        frame = self._frames.get(index)
+        return None if frame is None else frame.keyframe
+
     def frame_pose(self, index: int) -> FramePose | None:
         """The frame's own measurement: against which keyframe, and where in it."""
         if index in self._keyframes:

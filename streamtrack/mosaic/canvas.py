@@ -6,7 +6,15 @@ import numpy as np
 
 from streamtrack.mosaic.preview import Preview
 from streamtrack.mosaic.spill import SpillFile
-from streamtrack.mosaic.tiles import TILE, Box, TileKey, TileStore, tile_box, tile_keys
+from streamtrack.mosaic.tiles import (
+    TILE,
+    Box,
+    TileKey,
+    TileStore,
+    common_box,
+    tile_box,
+    tile_keys,
+)
 from streamtrack.types import Image
 
 
@@ -72,9 +80,8 @@ _MOST_CHANGED = 64
 
 def _common(key: TileKey, box: Box) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
     """What a tile and a box share: the part of the tile, and the part of the box."""
-    tx0, ty0, tx1, ty1 = tile_box(key)
-    x0, y0 = max(box[0], tx0), max(box[1], ty0)
-    x1, y1 = min(box[2], tx1), min(box[3], ty1)
+    tx0, ty0, _, _ = tile_box(key)
+    x0, y0, x1, y1 = common_box(tile_box(key), box)
     there = slice(y0 - ty0, y1 - ty0), slice(x0 - tx0, x1 - tx0)
     here = slice(y0 - box[1], y1 - box[1]), slice(x0 - box[0], x1 - box[0])
     return there, here

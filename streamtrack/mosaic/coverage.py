@@ -39,17 +39,17 @@ def footprint(
     """
     quad = geometry.transform_points(world_from_frame, geometry.image_quad(size_wh))
     x0, y0, x1, y1 = (int(np.floor(v / cell_px)) for v in geometry.bounding_box(quad))
-    columns, rows = np.arange(x0, x1 + 1), np.arange(y0, y1 + 1)
-    x, y = np.meshgrid((columns + 0.5) * cell_px, (rows + 0.5) * cell_px)
-    a, b = quad.astype(np.float64), np.roll(quad, -1, axis=0).astype(np.float64)
-    seen = np.ones(x.shape, np.bool_)
-    for (ax, ay), (bx, by) in zip(a, b, strict=True):  # clockwise: inside is to the right
-        seen &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= 0
+    x = (np.arange(x0, x1 + 1) + 0.5) * cell_px
+    y = ((np.arange(y0, y1 + 1) + 0.5) * cell_px)[:, None]
+    corners = quad.tolist()
+    seen = np.ones((len(y), len(x)), np.bool_)
+    for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
+        seen &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= 0  # clockwise: inside is right
     for outline in hidden:
         there = geometry.transform_points(world_from_frame, outline) / cell_px
-        corners = np.rint(np.clip(there - (x0 + 0.5, y0 + 0.5), -1e4, 1e4)).astype(np.int32)
+        polygon = np.rint(np.clip(there - (x0 + 0.5, y0 + 0.5), -1e4, 1e4)).astype(np.int32)
         inside = np.zeros(seen.shape, np.uint8)
-        cv2.fillConvexPoly(inside, corners, 1)
+        cv2.fillConvexPoly(inside, polygon, 1)
         seen &= inside == 0
     return Footprint(x0, y0, seen)
 

@@ -11,7 +11,7 @@ import numpy as np
 from streamtrack import geometry
 from streamtrack.mosaic import painting
 from streamtrack.mosaic.consensus import Chooser
-from streamtrack.mosaic.tiles import Box
+from streamtrack.mosaic.tiles import Box, common_box
 from streamtrack.mosaic.views import View, ViewStore
 from streamtrack.settings import Warping
 from streamtrack.types import Image, Matrix
@@ -63,7 +63,7 @@ class Renderer:
             x0, y0, x1, y1 = reach
             if x0 < box[2] and x1 > box[0] and y0 < box[3] and y1 > box[1]:
                 is_primary = primary is None or view.number in primary
-                chooser.add(self._warped(view, reach, box), is_primary, view.moment)
+                chooser.add(self.warped(view, box), is_primary, view.moment)
                 yield
 
     def remember(self, view: View, pixels: Image) -> None:
@@ -79,13 +79,15 @@ class Renderer:
         if pixels is not None:
             self._bytes -= pixels.nbytes
 
-    def _warped(self, view: View, reach: Box, box: Box) -> Image:
-        """A view in a box of the picture; only the part that it reaches is warped."""
-        pixels = self._pixels(view)
+    def warped(self, view: View, box: Box) -> Image:
+        """A view in a box of the picture (H, W, 4); only the part that it reaches is warped."""
+        pixels, matrix = self._pixels(view), self.canvas_from_frame(view)
+        x0, y0, x1, y1 = common_box(painting.box_of(matrix, view.size_wh), box)
+        result = np.zeros((box[3] - box[1], box[2] - box[0], 4), np.uint8)
+        if x0 >= x1 or y0 >= y1:
+            return result
         factor = pixels.shape[1] / view.size_wh[0], pixels.shape[0] / view.size_wh[1]
-        matrix = self.canvas_from_frame(view) @ geometry.inverted(geometry.scaling(*factor))
-        x0, y0 = max(reach[0], box[0]), max(reach[1], box[1])
-        x1, y1 = min(reach[2], box[2]), min(reach[3], box[3])
+        matrix = matrix @ geometry.inverted(geometry.scaling(*factor))
         part = painting.warped(pixels, matrix, (x0, y0, x1, y1), self._flags)
         if self._flags in (cv2.INTER_CUBIC, cv2.INTER_LANCZOS4):
             # Wide kernels ring at the frame's edge, where colours would fall to black.
@@ -95,7 +97,6 @@ class Renderer:
                 pixels, into_part, size, flags=self._flags, borderMode=cv2.BORDER_REPLICATE
             )
             part[..., :3] = kept[..., :3]
-        result = np.zeros((box[3] - box[1], box[2] - box[0], 4), np.uint8)
         into = slice(y0 - box[1], y1 - box[1]), slice(x0 - box[0], x1 - box[0])
         result[into] = painting.with_gain(part, view.log_gain)
         return result

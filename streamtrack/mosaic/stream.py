@@ -18,6 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
+import cv2
 import numpy as np
 
 from streamtrack import geometry
@@ -45,7 +46,7 @@ MOST_EXTENT_PX = 100_000.0
 
 _LEAST_SHARE = 0.01
 _MOVED_PX = 0.5
-_CHECKED_A_FRAME, _MOVED_A_FRAME = 64, 6
+_CHECKED_A_FRAME, _MOVED_A_FRAME = 64, 3
 _SAMPLES_TO_JUDGE = 3
 _LEAST_CONTESTED = 16
 _TILE_SHARE, _VIEW_SHARE, _CACHE_SHARE = 0.5, 0.2, 0.15
@@ -78,15 +79,17 @@ class PoseGraph(Protocol):
         """A frame of which the pose will always be asked for."""
         ...
 
+    def keyframe_of(self, index: int) -> int | None:
+        """The keyframe that a frame moves with; None if that is not known."""
+        ...
+
 
 @dataclass(slots=True)
 class StreamFigures:
-    """What a mosaic did so far: frames and pixels by what became of them."""
+    """What a mosaic did so far: frames by what became of them."""
 
     painted: int = 0
     refused: Counter[str] = field(default_factory=Counter)
-    overlap: int = 0
-    contested: int = 0
     moved_views: int = 0
 
 
@@ -125,7 +128,9 @@ class StreamMosaic:
         self._outline: Points | None = None
         self._checking: deque[View] = deque()
         self._revision = 0 if graph is None else graph.revision
+        self._keyframe_poses: dict[int, Matrix] = {}
         self._full = ""
+        self._has_painted = False
         self.figures = StreamFigures()
 
     def __enter__(self) -> Self:
@@ -244,32 +249,31 @@ class StreamMosaic:
             self._full = f"the mosaic grows no further since frame {given.frame.index}: {error}"
 
     def _paint(self, image: Image, view: View) -> None:
-        pixels = painting.weighted(image, view.quads, self._scale)
-        self._renderer.remember(view, pixels)
-        pixels = painting.with_gain(pixels, view.log_gain)
-        factor = pixels.shape[1] / view.size_wh[0], pixels.shape[0] / view.size_wh[1]
-        canvas_from_frame = geometry.scaling(self._scale) @ view.world_from_frame
+        """Paint what the canvas does not show yet; where they disagree it is judged later."""
+        self._renderer.remember(view, painting.weighted(image, view.quads, self._scale))
+        canvas_from_frame = self._renderer.canvas_from_frame(view)
         box = painting.box_of(canvas_from_frame, view.size_wh)
-        new = painting.warped(
-            pixels, canvas_from_frame @ geometry.inverted(geometry.scaling(*factor)), box
-        )
-        painted = painting.paint(painting.Patch(box, self._canvas.read(box)), new)
-        if painted.patch is not None:
-            self._canvas.write(painted.patch.box, painted.patch.pixels)
+        small = painting.shrunk(image, view.quads, canvas_from_frame, self._scale, box)
+        small = painting.with_gain(small, view.log_gain)
+        seen = painting.compared(box, painting.quartered(self._canvas.read(box)), small)
+        for part in seen.parts():
+            new = self._renderer.warped(view, part)
+            painted = painting.paint(self._canvas.read(part), new, seen.differs_in(part))
+            self._canvas.write(part, painted)
         self.figures.painted += 1
-        self.figures.overlap += painted.overlap
-        self.figures.contested += painted.contested
-        if painted.differs is not None:
-            self._mark_contested(box, painted.differs)
+        self._has_painted = True
+        self._mark_contested(box, seen.differs)
 
     def _mark_contested(self, box: Box, differs: Image) -> None:
         """Tiles with enough samples to judge what stands where they disagree are done again."""
+        if not cv2.countNonZero(differs):
+            return
         store, rerender = self._parts()
-        rows, columns = np.nonzero(differs)
+        rows, columns = (place * painting.SHRINK for place in np.nonzero(differs))
         found = Counter(
             zip(
-                ((columns * 4 + box[0]) // TILE).tolist(),
-                ((rows * 4 + box[1]) // TILE).tolist(),
+                ((columns + box[0]) // TILE).tolist(),
+                ((rows + box[1]) // TILE).tolist(),
                 strict=True,
             )
         )
@@ -290,12 +294,28 @@ class StreamMosaic:
             return
         if self._graph is not None and self._graph.revision != self._revision:
             self._revision = self._graph.revision
-            self._checking = deque(self._store.views.values())
+            self._checking = deque(self._moved_with_keyframes(self._graph, self._store))
         self._check(_CHECKED_A_FRAME, _MOVED_A_FRAME)
+        if self._has_painted:  # enough for one frame
+            self._has_painted = False
+            return
         try:
             self._rerender.step((float(self._near[0]), float(self._near[1])))
         except OutputError as error:
             self._full = self._full or f"parts of the mosaic are not brought up to date: {error}"
+
+    def _moved_with_keyframes(self, graph: PoseGraph, store: ViewStore) -> list[View]:
+        """The views whose keyframes lie elsewhere since last asked, and those still to check."""
+        poses = {index: one.world_from_keyframe for index, one in graph.keyframes.items()}
+        before, self._keyframe_poses = self._keyframe_poses, poses
+        moved: set[int | None] = {i for i, pose in poses.items() if pose is not before.get(i)}
+        moved.add(None)
+        waiting = {view.number for view in self._checking}
+        return [
+            view
+            for view in store.views.values()
+            if view.number in waiting or graph.keyframe_of(view.frame) in moved
+        ]
 
     def _check(self, most: int, most_moved: float) -> None:
         """Take over poses that changed by more than half a pixel, of so many of the views."""

@@ -39,6 +39,16 @@ def tile_box(key: TileKey) -> Box:
     return x0, y0, x0 + TILE, y0 + TILE
 
 
+def common_box(one: Box, other: Box) -> Box:
+    """What two boxes that overlap have in common."""
+    return (
+        max(one[0], other[0]),
+        max(one[1], other[1]),
+        min(one[2], other[2]),
+        min(one[3], other[3]),
+    )
+
+
 class TileStore:
     """Tiles uint8 (256, 256, 4) by key: blue, green, red and weight, 0 where nothing is painted.
 

@@ -7,6 +7,7 @@ that nothing needs any more are dropped, so the store grows with the area seen, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -52,6 +53,14 @@ class View:
     cells: Footprint
     log_gain: gains.LogGain
     edges: list[gains.GainEdge] = field(default_factory=list)
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Where the middle of the frame lies in the world."""
+        (a, b, c), (d, e, f), (g, h, i) = self.world_from_frame.tolist()
+        x, y = (self.size_wh[0] - 1) / 2, (self.size_wh[1] - 1) / 2
+        depth = g * x + h * y + i
+        return (a * x + b * y + c) / depth, (d * x + e * y + f) / depth
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,17 +257,12 @@ class ViewStore:
 
 def _nearest(view: View, others: Sequence[View]) -> Iterable[View]:
     """The few whose centres are nearest: they overlap most."""
-    centre = geometry.transform_points(view.world_from_frame, _centre(view))[0]
+    x, y = view.centre
 
     def distance(other: View) -> float:
-        there = geometry.transform_points(other.world_from_frame, _centre(other))[0]
-        return float(np.hypot(*(there - centre)))
+        return math.hypot(other.centre[0] - x, other.centre[1] - y)
 
     return sorted(others, key=distance)[:_NEIGHBOURS]
-
-
-def _centre(view: View) -> list[list[float]]:
-    return [[(view.size_wh[0] - 1) / 2, (view.size_wh[1] - 1) / 2]]
 
 
 def _first_moments(first: np.typing.NDArray[np.int32], moment: int) -> np.typing.NDArray[np.int32]:

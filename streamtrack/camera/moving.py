@@ -20,7 +20,7 @@ from streamtrack.camera.keyframe_links import LevelCache, NewKeyframe, link_of, 
 from streamtrack.camera.keyframes import KeyframeGraph
 from streamtrack.camera.loops import LoopCloser
 from streamtrack.camera.relocalising import Relocaliser
-from streamtrack.camera.view_alignment import align, align_exactly
+from streamtrack.camera.view_alignment import align, align_exactly, align_near
 from streamtrack.camera.view_levels import ReferenceView, ViewLevels
 from streamtrack.camera.view_verdict import ViewAlignment
 from streamtrack.fitting import fit
@@ -140,6 +140,10 @@ class MovingCamera:
         """The frame against the keyframe of the frame before, where the motion leads or leaves."""
         reference = self._reference(state.keyframe)
         guess = state.predicted(view.frame.time_s)
+        if state.step is not None:
+            found = _without_jump(align_near(reference, levels, guess, hidden), guess, view.size_wh)
+            if found.reference_from_view is not None:
+                return found
         found = _without_jump(align(reference, levels, guess, hidden), guess, view.size_wh)
         if found.reference_from_view is not None:
             return found
@@ -281,7 +285,7 @@ class MovingCamera:
     ) -> None:
         frame = view.frame
         outlines = reference.hidden
-        self.graph.add_keyframe(frame.index, frame.time_s, frame.image, world_from_frame, outlines)
+        self.graph.add_keyframe(frame.index, frame.time_s, view.grey, world_from_frame, outlines)
         if link is not None:
             self.graph.add_link(link, is_loop=False)
         self._levels.add(frame.index, reference.levels)

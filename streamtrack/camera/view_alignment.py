@@ -13,6 +13,7 @@ The outcome is judged cell by cell (see `view_verdict`).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TypeAlias
 
 import cv2
@@ -46,6 +47,7 @@ _SHAPE_SIGMA = 0.15
 _MIN_SHAPE_SHARE = 0.6  # of agreeing cells, for a mapping richer than a similarity
 _MIN_STIFF_SHARE = 0.85  # of its agreeing cells that a similarity must keep
 _MAX_STIFF_UNLIKE = 1.25  # and the factor by which they may be less alike
+_NEAR_SHARE = 0.015  # of the view: as far a guess may be off where coarse levels are left out
 _SEARCH_SHARE = 0.3  # of the view: how far the search for a shift reaches
 
 _SIMILARITY = np.stack(
@@ -76,10 +78,44 @@ def align(
         return refusal(Verdict.PERSPECTIVE)
     if is_searched:
         view_from_reference = _shifted(reference, view, view_from_reference)
-    last = min(len(reference.levels.images), len(view.images)) - 1
+    coarsest = min(len(reference.levels.images), len(view.images)) - 1
+    return _descended(reference, view, view_from_reference, hidden, coarsest)
+
+
+def align_near(
+    reference: ReferenceView, view: ViewLevels, guess: Matrix, hidden: Sequence[Points] = ()
+) -> ViewAlignment:
+    """As `align`, from a guess that is right to a few pixels: without the coarser levels.
+
+    An alignment that ends farther from its guess than that is refused as uncertain.
+    """
+    try:
+        start = geometry.inverted(guess)
+    except np.linalg.LinAlgError:
+        return refusal(Verdict.MIRRORED)
+    coarsest = min(USUAL + 1, len(reference.levels.images) - 1, len(view.images) - 1)
+    found = _descended(reference, view, start, hidden, coarsest)
+    if found.reference_from_view is None:
+        return found
+    corners = geometry.image_quad(view.size_wh)
+    ends = (geometry.transform_points(m, corners) for m in (guess, found.reference_from_view))
+    moved_px = float(np.abs(np.subtract(*ends)).max())
+    if moved_px <= _NEAR_SHARE * view.size_wh[0]:
+        return found
+    return replace(found, verdict=Verdict.UNCERTAIN, reference_from_view=None)
+
+
+def _descended(
+    reference: ReferenceView,
+    view: ViewLevels,
+    start: Matrix,
+    hidden: Sequence[Points],
+    coarsest: int,
+) -> ViewAlignment:
+    """The fit from level to level, the coarsest first, judged; ``start`` is view_from_reference."""
     fitted: Fitted | None = None
-    start = view_from_reference
-    for level in range(last, USUAL - 1, -1):
+    view_from_reference = start
+    for level in range(coarsest, USUAL - 1, -1):
         if fitted is not None and _differ(view_from_reference, start, view, level):
             # Coarse levels may lead astray where texture is fine or weak.
             tried = (view_from_reference, start)

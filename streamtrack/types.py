@@ -204,6 +204,7 @@ class Verdict(StrEnum):
     UNCERTAIN = "corners too uncertain"
     AMBIGUOUS = "repeated texture, another place fits as well"
     STRETCHED = "frame would cover more than four times its area"
+    SHEARED = "most of the view moves by itself, and the rest would be sheared"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

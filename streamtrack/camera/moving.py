@@ -20,6 +20,7 @@ from streamtrack.camera.keyframe_links import LevelCache, NewKeyframe, link_of, 
 from streamtrack.camera.keyframes import KeyframeGraph
 from streamtrack.camera.loops import LoopCloser
 from streamtrack.camera.relocalising import Relocaliser
+from streamtrack.camera.shear import ShearWatch
 from streamtrack.camera.view_alignment import align, align_exactly, align_near
 from streamtrack.camera.view_levels import ReferenceView, ViewLevels
 from streamtrack.camera.view_verdict import ViewAlignment
@@ -99,6 +100,7 @@ class MovingCamera:
         self._loops = LoopCloser(self.graph, is_live)
         self._relocaliser = Relocaliser(self.graph, settings)
         self._references: dict[int, ReferenceView] = {}
+        self._shear = ShearWatch()
         self._state: _State | None = None
 
     def update(self, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
@@ -131,6 +133,7 @@ class MovingCamera:
         if cells < _MIN_TEXTURED_CELLS:
             return CameraPose(None, reason=str(Verdict.TOO_FEW_FEATURES))
         self._take(view, reference, np.eye(3), None)
+        self._shear.begin(view.frame.index)
         self._state = _State(view.frame.index, np.eye(3), view.frame.time_s, None, 0.0)
         return CameraPose(np.eye(3), cells, cells, 0.0, keyframe=view.frame.index, is_keyframe=True)
 
@@ -176,6 +179,8 @@ class MovingCamera:
         index, matches = view.frame.index, len(found.is_inlier)
         world_from_keyframe = self.graph.keyframes[keyframe].world_from_keyframe
         world_from_frame = geometry.normalized(world_from_keyframe @ keyframe_from_frame)
+        if self._shear.is_sheared(keyframe, found, view.size_wh):
+            return CameraPose(None, matches, found.inliers, found.rmse_px, str(Verdict.SHEARED))
         self._remember(view, keyframe, keyframe_from_frame)
         if _stretch(world_from_frame, view.size_wh) > _MAX_STRETCH:
             return CameraPose(None, matches, found.inliers, found.rmse_px, str(Verdict.STRETCHED))
@@ -276,6 +281,7 @@ class MovingCamera:
         world_from_keyframe = self.graph.keyframes[keyframe].world_from_keyframe
         world_from_frame = geometry.normalized(world_from_keyframe @ keyframe_from_frame)
         self._take(view, reference, world_from_frame, link)
+        self._shear.extend(keyframe, found, index)
         self._go_over(index, np.eye(3))
         self._loops.add(NewKeyframe(index, reference, keyframe, found if is_sure else None))
         return True

@@ -154,8 +154,8 @@ class KeyframeGraph:
         return geometry.normalized(world_from_keyframe @ frame.keyframe_from_frame)
 
     def keyframe_of(self, index: int) -> int | None:
-        """The keyframe against which a frame was measured."""
-        frame = self._frames.get(index)
+        """The keyframe that a frame moves with: itself, or the one it was measured against."""
+        frame = self.frame_pose(index)
         return None if frame is None else frame.keyframe
 
     def frame_pose(self, index: int) -> FramePose | None:

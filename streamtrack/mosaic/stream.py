@@ -129,6 +129,7 @@ class StreamMosaic:
         self._checking: deque[View] = deque()
         self._revision = 0 if graph is None else graph.revision
         self._keyframe_poses: dict[int, Matrix] = {}
+        self._keyframe_of: dict[int, int | None] = {}
         self._full = ""
         self._has_painted = False
         self.figures = StreamFigures()
@@ -243,8 +244,11 @@ class StreamMosaic:
             if self._graph is not None:
                 self._graph.keep(given.frame.index)
             self._paint(given.frame.image, view)
+            if self._graph is not None:
+                self._keyframe_of[view.number] = self._graph.keyframe_of(view.frame)
             for dropped in store.thin(view):
                 self._renderer.forget(dropped)
+                self._keyframe_of.pop(dropped.number, None)
         except OutputError as error:
             self._full = f"the mosaic grows no further since frame {given.frame.index}: {error}"
 
@@ -314,7 +318,7 @@ class StreamMosaic:
         return [
             view
             for view in store.views.values()
-            if view.number in waiting or graph.keyframe_of(view.frame) in moved
+            if view.number in waiting or self._keyframe_of.get(view.number) in moved
         ]
 
     def _check(self, most: int, most_moved: float) -> None:

@@ -173,7 +173,7 @@ def test_steps_are_shown_small_and_in_place(file_server, address):
     np.testing.assert_allclose(corners[3], small, atol=0.01)
     assert "/targets/board/view" in rrd_entities(received)
     states = rrd_columns(received, "/targets/board/state", "StateChange:state")[1]
-    assert states == [["tracking"], ["lost"]]
+    assert states == [["tracking"], ["lost"], ["no picture"]]
     lines = [line for (line,) in rrd_columns(received, "/log", "TextLog:text")[1]]
     assert "hello" in lines
     assert rrd_columns(received, "/source/state", "StateChange:state")[1] == [["stalled"]]

@@ -551,6 +551,21 @@ def test_capture_times_ages_and_epochs_of_a_live_source(tmp_path):
     assert lines == ([3], [["frame 3: the source began anew"]])
 
 
+def test_targets_have_no_state_while_a_live_source_is_away(tmp_path):
+    path = tmp_path / "live.rrd"
+    with Recorder(path, source(is_live=True), Settings(), ["board"]) as recorder:
+        recorder.log_source("streaming")
+        for index in range(2):
+            recorder.log(step_of(index))
+        recorder.log_source("stalled", time_s=1.0)
+        recorder.log_source("connecting", time_s=2.0)
+        recorder.log_source("streaming", time_s=3.0)
+        recorder.log(step_of(90))
+    times, states = rrd_columns(path, "/targets/board/state", "StateChange:state", "video_time")
+    assert states == [["tracking"], ["no picture"], ["tracking"]]
+    assert times[0] < times[1] == 1_000_000_000 < times[2]
+
+
 def test_a_file_that_another_run_writes_is_left_alone(tmp_path):
     path = tmp_path / "run.rrd"
     with Recorder(path, source(), Settings(), []) as recorder:

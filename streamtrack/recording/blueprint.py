@@ -65,17 +65,21 @@ LANE_BLUE: Rgb = (66, 140, 230)
 LANE_GREEN: Rgb = (64, 160, 80)
 LANE_RED: Rgb = (214, 72, 66)
 LANE_YELLOW: Rgb = (205, 150, 40)
+NO_PICTURE = "no picture"
+"""What a target's lane says while a live source is away."""
+_ENDED_GREY: Rgb = (110, 115, 125)
 _STATE_COLORS: dict[str, Rgb] = {
     TrackState.SEARCHING: LANE_BLUE,
     TrackState.TRACKING: LANE_GREEN,
     TrackState.LOST: LANE_RED,
+    NO_PICTURE: _ENDED_GREY,
 }
 _SOURCE_COLORS: dict[str, Rgb] = {
     "connecting": LANE_BLUE,
     "streaming": LANE_GREEN,
     "stalled": LANE_YELLOW,
     "waiting": LANE_RED,
-    "ended": (110, 115, 125),
+    "ended": _ENDED_GREY,
 }
 _TARGET_COLORS: tuple[Rgb, ...] = (
     (255, 205, 0),

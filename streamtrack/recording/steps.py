@@ -24,6 +24,7 @@ from streamtrack.recording.target import TargetLog
 from streamtrack.recording.tracks import TracksTable
 from streamtrack.recording.video import Clock, Video, without_video
 from streamtrack.settings import Settings, WorldSettings
+from streamtrack.sources.live_status import LiveState
 from streamtrack.types import (
     Frame,
     Image,
@@ -151,6 +152,9 @@ class StepLog:
         if state != self._source_state:
             self._source_state = state
             self._log_source_state()
+            if state in (LiveState.STALLED, LiveState.WAITING):
+                for target in self._targets.values():
+                    target.pause()
         for number, (name, count) in enumerate(counts.items()):
             path = rr.new_entity_path([*blueprint.SOURCE_COUNTS.split("/"), name])
             if name not in self._counts:

@@ -40,14 +40,14 @@ class TargetLog:
         self._box: tuple[float, float, float, float] | None = None
         self._frames_to_close_up = 0
         self._template = None if template is None else _shrunk(template)
-        self._is_first_in_part = True
+        self._is_state_due = True
 
     def begin(self, count: int) -> None:
         """Record what each part needs at its start, for one of ``count`` targets."""
         blueprint.log_target_styles(self._stream, self._entities, self._name, self._number, count)
         if self._template is not None:
             self._log_template(self._template)
-        self._is_first_in_part = True
+        self._is_state_due = True
 
     def points_before(self, track: Track) -> Points | None:
         """Where the evidence's points were one step earlier, or else in the first frame."""
@@ -64,8 +64,8 @@ class TargetLog:
         message = ""
         if before is not track.state:
             message = _transition(step.frame.index, track, before)
-        if message or self._is_first_in_part:
-            self._is_first_in_part = False
+        if message or self._is_state_due:
+            self._is_state_due = False
             self._stream.log(self._entities.state, rr.StateChange(state=str(track.state)))
             self._frames_to_close_up = 0
         if track.quad is not None:
@@ -77,6 +77,11 @@ class TargetLog:
         self._log_numbers(track)
         self._frame_from_template = track.frame_from_template
         return message
+
+    def pause(self) -> None:
+        """No more pictures come for now: the state was that of the last one."""
+        self._stream.log(self._entities.state, rr.StateChange(state=blueprint.NO_PICTURE))
+        self._is_state_due = True
 
     def _log_quad(self, quad: Points) -> None:
         outline = np.concatenate([quad, quad[:1]])[None]

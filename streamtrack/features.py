@@ -359,10 +359,21 @@ def _make_detector(name: str, threshold: float) -> cv2.Feature2D:
     return makers[name]()
 
 
+@cache
+def _freak() -> cv2.Feature2D:
+    """FREAK, with its table of patterns made: 20 ms, so one serves all.
+
+    Describing only reads the table, from any thread.
+    """
+    freak = cv2.xfeatures2d.FREAK.create()
+    freak.compute(np.zeros((128, 128), np.uint8), [cv2.KeyPoint(64, 64, _CORNER_SIZE_PX)])
+    return freak
+
+
 def _make_describer(detector: str, descriptor: str) -> cv2.Feature2D:
     teblid_scale = _TEBLID_SCALE.get(detector, _TEBLID_SCALE_OTHERS)
     makers: dict[str, Callable[[], cv2.Feature2D]] = {
-        "freak": lambda: cv2.xfeatures2d.FREAK.create(),
+        "freak": _freak,
         "brisk": lambda: cv2.xfeatures2d.BRISK.create(),
         "orb": lambda: cv2.ORB.create(),
         "teblid": lambda: cv2.xfeatures2d.TEBLID.create(

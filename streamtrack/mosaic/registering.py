@@ -119,11 +119,10 @@ class PictureRegistrar:
         is_swapped = _is_coarser(b_from_a, found, a.features)
         near, far = (b, a) if is_swapped else (a, b)
         start = geometry.inverted(b_from_a) if is_swapped else b_from_a
-        near_view, far_view = (Pyramid(geometry.grey_of(p.image)) for p in (near, far))
-        fit = self._fit(near_view, far_view, start, int(np.count_nonzero(found.is_inlier)))
+        fit = self._fit(near.pyramid, far.pyramid, start, int(np.count_nonzero(found.is_inlier)))
         if fit is None:
             return _refusal(a, b, found, Verdict.LOW_CORRELATION)
-        aligned, final = self._aligned(fit, far_view)
+        aligned, final = self._aligned(fit, far.pyramid)
         exact = geometry.inverted(aligned) if is_swapped else aligned
         points = (
             (fit.far_points, fit.near_points) if is_swapped else (fit.near_points, fit.far_points)

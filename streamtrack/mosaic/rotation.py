@@ -21,12 +21,13 @@ import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.mosaic.types import Link
-from streamtrack.types import Matrix, Size
+from streamtrack.types import Matrix, Points, Size
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
 _MAX_PAIRS = 120  # of each link
 _ROUNDS = 25
+_FEW_POINTS = 30  # of each link, to tell focal lengths apart
 _FREE_FOCAL = 0.01  # relative deviation of one picture's focal length from the common one
 _FOCAL_RANGE = (0.25, 20.0)  # of the longer side: 127 to 3 degrees of view
 _MIN_NOISE_PX = 0.1
@@ -126,22 +127,33 @@ def _starting_focal(links: Sequence[Link], sizes: Mapping[int, Size]) -> tuple[f
     if candidates:
         candidates = [float(v) for v in np.quantile(candidates, [0.1, 0.3, 0.5, 0.7, 0.9])]
     candidates += [0.6, 0.9, 1.3, 2.0, 3.5, 7.0]
-    misfits = [_median_misfit(focal, links, sizes) for focal in candidates]
+    looks = [_few_inliers(link) for link in links]
+    misfits = [_median_misfit(focal, links, looks, sizes) for focal in candidates]
     best = int(np.argmin(misfits))
     return candidates[best], misfits[best]
 
 
-def _median_misfit(focal: float, links: Sequence[Link], sizes: Mapping[int, Size]) -> float:
+def _few_inliers(link: Link) -> tuple[Points, Points]:
+    """Some inliers of a, evenly chosen, and where the link's homography sees them in b."""
+    assert link.b_from_a is not None
+    points = link.a_points[link.registration.is_inlier]
+    few = points[:: max(1, len(points) // _FEW_POINTS)]
+    return few, geometry.transform_points(link.b_from_a, few)
+
+
+def _median_misfit(
+    focal: float,
+    links: Sequence[Link],
+    looks: Sequence[tuple[Points, Points]],
+    sizes: Mapping[int, Size],
+) -> float:
     errors = []
-    for link in links:
+    for link, (points, seen) in zip(links, looks, strict=True):
         assert link.b_from_a is not None
         k_a = camera_matrix(focal * max(sizes[link.a]), sizes[link.a])
         k_b = camera_matrix(focal * max(sizes[link.b]), sizes[link.b])
         turned = k_b @ rotation_between(link.b_from_a, k_a, k_b) @ np.linalg.inv(k_a)
-        points = link.a_points[link.registration.is_inlier]
-        error = geometry.transform_points(turned, points) - geometry.transform_points(
-            link.b_from_a, points
-        )
+        error = geometry.transform_points(turned, points) - seen
         errors.append(float(np.median(np.linalg.norm(error, axis=1))))
     return float(np.median(errors))
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 
+from streamtrack import geometry
+from streamtrack.pyramid import Pyramid
 from streamtrack.types import (
     Features,
     Image,
@@ -18,7 +21,7 @@ from streamtrack.types import (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Picture:
     """One picture to be placed in a mosaic, with its features (full-resolution pixels).
 
@@ -33,6 +36,11 @@ class Picture:
     @property
     def size_wh(self) -> Size:
         return self.image.shape[1], self.image.shape[0]
+
+    @cached_property
+    def pyramid(self) -> Pyramid:
+        """The picture in grey at halved resolutions, one for all its links."""
+        return Pyramid(geometry.grey_of(self.image))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,7 +28,7 @@ import numpy.typing as npt
 
 from streamtrack.auto import AutoTargets
 from streamtrack.auto.assignment import assign
-from streamtrack.auto.followed import overlaps
+from streamtrack.auto.boxes import overlaps
 from streamtrack.camera.auto import make_camera
 from streamtrack.features import FeatureExtractor
 from streamtrack.frame_view import FrameView

@@ -15,7 +15,7 @@ import pytest
 from streamtrack import AutoTarget, track
 from streamtrack.auto import AutoTargets
 from streamtrack.auto.assignment import assign
-from streamtrack.auto.followed import overlap
+from streamtrack.auto.boxes import overlap
 from streamtrack.errors import UsageError
 from streamtrack.features import FeatureExtractor
 from streamtrack.frame_view import FrameView
@@ -225,6 +225,33 @@ def test_what_is_hidden_is_lost_and_found_again_under_its_name() -> None:
     assert hidden and all(t.quad is None for i in hidden for t in steps[i])
     assert names[20] == "auto-1"
     assert names[60] == "auto-1"
+
+
+def test_what_goes_slowly_under_a_bridge_keeps_its_size_place_and_name() -> None:
+    world = World()
+    world.add("car", (60, 26))
+    frames, truth = [], []
+    for index in range(110):
+        frame, boxes = world.frame(index, {"car": (10 + 2.0 * index, 110)})
+        image = frame.image.copy()
+        image[:, 120:150] = world.ground[:, 500:530]  # narrower than the car
+        frames.append(Frame(index, frame.time_s, image))
+        truth.append(boxes)
+    steps = follow(frames)
+    names = names_on(steps, truth, "car")
+    assert all_names(steps) == {"auto-1"}
+    assert names[12:].count(None) <= 2
+
+
+def test_a_small_thing_beside_a_large_one_is_no_part_of_it() -> None:
+    def path(n: int) -> dict[str, tuple[float, float]]:
+        return {"large": (20 + 2.5 * n, 100), "small": (120 + 1.0 * n, 180 - 1.8 * n)}
+
+    frames, truth = played(path, 95, {"large": (60, 30), "small": (14, 22)})
+    steps = follow(frames)
+    names = names_on(steps, truth, "large")
+    assert set(names[15:]) <= {names[15], None} and names[15] is not None
+    assert names[15:].count(None) <= 4
 
 
 def _static(index: int, rng: np.random.Generator, ground: Image) -> Image:

@@ -11,13 +11,15 @@ import numpy.typing as npt
 
 from streamtrack.auto.assignment import assign
 from streamtrack.auto.blobs import Blob, united_blob
-from streamtrack.auto.followed import Followed, Life, overlap, overlaps
+from streamtrack.auto.boxes import overlap, overlaps
+from streamtrack.auto.followed import Followed, Life
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
 _MAX_COST = 1.7
 _FRAGMENT_INSIDE = 0.7  # of a fragment's area that lies in the predicted box
 _FRAGMENT_SHARE = 0.4  # of the largest of them
+_PARTS_APART = 0.2  # of the reach, between the motions of fragments of one thing
 _SHARED_INSIDE = 0.55  # of a predicted box that lies in a blob it shares
 _SHARED_LARGER = 1.3  # how much larger than each of its things a shared blob is
 _MAX_COLOR_DISTANCE = 0.55
@@ -37,7 +39,7 @@ class Associated:
 
 def associate(things: Sequence[Followed], blobs: Sequence[Blob], reach_px: float) -> Associated:
     """Pair things, already predicted, with blobs; ``reach_px`` is added to every gate."""
-    wholes = _put_together(things, blobs)
+    wholes = _put_together(things, blobs, reach_px)
     found = dict(assign(_costs(things, wholes, reach_px)))
     shared = {column: _sharing(things, blob, column, found) for column, blob in enumerate(wholes)}
     shared = {column: rows for column, rows in shared.items() if rows}
@@ -83,7 +85,7 @@ def _costs(things: Sequence[Followed], blobs: Sequence[Blob], reach_px: float) -
     return np.where(is_beyond, np.inf, costs)
 
 
-def _put_together(things: Sequence[Followed], blobs: Sequence[Blob]) -> list[Blob]:
+def _put_together(things: Sequence[Followed], blobs: Sequence[Blob], reach_px: float) -> list[Blob]:
     """The blobs, those that are fragments of one thing made one."""
     if not things or not blobs:
         return list(blobs)
@@ -104,14 +106,36 @@ def _put_together(things: Sequence[Followed], blobs: Sequence[Blob]) -> list[Blo
         parts = np.flatnonzero((inside[row] >= _FRAGMENT_INSIDE) & ~is_other_whole).tolist()
         parts = [part for part in parts if part not in gone]
         sizes = sorted(areas[parts])
-        if len(parts) < 2 or sizes[-2] > _FRAGMENT_SHARE * sizes[-1]:
-            continue  # two that are alike in size are two things
+        if len(parts) < 2:
+            continue
+        largest = blobs[max(parts, key=lambda part: float(areas[part]))]
+        if sizes[-2] > _FRAGMENT_SHARE * sizes[-1] and not all(
+            _is_in_line(blobs[part], largest, things[row].velocity) for part in parts
+        ):
+            continue  # two that are alike in size are two things, if nothing parts them
+        parts = [part for part in parts if not _moves_otherwise(blobs[part], largest, reach_px)]
+        if len(parts) < 2:
+            continue
         whole = united_blob([blobs[part] for part in parts])
         if overlap(whole.box, things[row].box)[0] > ious[row, parts].max():
             united[parts[0]] = whole
             gone.update(parts)
     kept = [blob for column, blob in enumerate(blobs) if column not in gone]
     return kept + list(united.values())
+
+
+def _is_in_line(blob: Blob, larger: Blob, velocity: Doubles) -> bool:
+    """Do two lie behind one another in the way they go, as what shows on both sides of a post?"""
+    across = int(np.argmin(np.abs(velocity)))
+    low = max(blob.box[across], larger.box[across])
+    high = min(blob.box[across + 2], larger.box[across + 2])
+    return bool(high - low > 0.5 * float(larger.size[across]))
+
+
+def _moves_otherwise(blob: Blob, larger: Blob, reach_px: float) -> bool:
+    """Never so if a motion is not known; beside what hides a thing flow sees it slower."""
+    apart, speed = np.hypot(*(blob.motion - larger.motion)), np.hypot(*larger.motion)
+    return bool(apart > _PARTS_APART * reach_px + 0.5 * speed)
 
 
 def _sharing(

@@ -25,6 +25,7 @@ from streamtrack.types import Image, Mask, Matrix, Size
 
 Floats: TypeAlias = npt.NDArray[np.float32]
 _Number = TypeVar("_Number", bound=np.generic)
+_Pixel = TypeVar("_Pixel", np.uint8, np.float32)
 
 _MAX_AGE = 40  # frames: the slowest the background follows
 _HEALED_AFTER = 10  # frames that something must have stood to be taken for background
@@ -247,6 +248,7 @@ class BackgroundModel:
         smooth, plain = cv2.INTER_LINEAR, cv2.INTER_NEAREST
         if not np.isfinite(new_from_grid).all():
             self._age[:] = 0
+            self._grey_before = None
             return
         self._mean = np.asarray(
             cv2.warpPerspective(
@@ -257,7 +259,10 @@ class BackgroundModel:
         self._deviation = _warped(self._deviation, new_from_grid, size, smooth)
         self._age = _warped(self._age, new_from_grid, size, plain)
         self._candidate_age[:] = 0
-        self._grey_before = None
+        if self._grey_before is not None:
+            self._grey_before = _warped(self._grey_before, new_from_grid, size, smooth)
+            seen_before = self._seen_before.astype(np.uint8)
+            self._seen_before = _warped(seen_before, new_from_grid, size, plain) > 0
 
     def _in_grid(self, small: Image, grid_from_small: Matrix) -> tuple[Image, Mask]:
         """The frame in the grid, and which of the grid's pixels it shows."""
@@ -300,8 +305,10 @@ def _shifted(array: npt.NDArray[_Number], dx: int, dy: int) -> npt.NDArray[_Numb
     return moved
 
 
-def _warped(array: Floats, matrix: Matrix, size_wh: Size, flags: int) -> Floats:
-    return np.asarray(cv2.warpPerspective(array, matrix, size_wh, flags=flags), np.float32)
+def _warped(
+    array: npt.NDArray[_Pixel], matrix: Matrix, size_wh: Size, flags: int
+) -> npt.NDArray[_Pixel]:
+    return np.asarray(cv2.warpPerspective(array, matrix, size_wh, flags=flags), array.dtype)
 
 
 def _light_change(grey: Image, background: Image, known: Mask) -> Floats | None:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.auto.background import Outstanding
+from streamtrack.auto.boxes import HasBox, box_around
 from streamtrack.types import Image, Mask
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
@@ -36,7 +37,7 @@ _TIGHT = 0.45  # spread within the parts against the distance between them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Blob:
+class Blob(HasBox):
     """One thing that stands out.
 
     box       (4,) x0, y0, x1, y1, full-resolution pixels of the frame
@@ -48,14 +49,6 @@ class Blob:
     box: Doubles
     motion: Doubles
     colors: Doubles
-
-    @property
-    def center(self) -> Doubles:
-        return 0.5 * (self.box[:2] + self.box[2:])
-
-    @property
-    def size(self) -> Doubles:
-        return self.box[2:] - self.box[:2]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,8 +231,7 @@ def frame_box(low: Doubles, high: Doubles, grid_from_frame: Doubles) -> tuple[Do
     center = 0.5 * (low + high)
     scale = geometry.local_scale(frame_from_grid, center)
     middle = geometry.transform_points(frame_from_grid, center)[0].astype(np.float64)
-    half = 0.5 * scale * (high - low)
-    return np.concatenate([middle - half, middle + half]), scale
+    return box_around(middle, scale * (high - low)), scale
 
 
 def color_histogram(image: Image, mask: Mask) -> Doubles:

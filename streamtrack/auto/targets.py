@@ -19,7 +19,8 @@ from streamtrack import geometry
 from streamtrack.auto.association import associate
 from streamtrack.auto.background import BackgroundModel, Outstanding
 from streamtrack.auto.blobs import Blob, MotionField, Scene, find_blobs, frame_px
-from streamtrack.auto.followed import Followed, Life, overlap, touched_edges
+from streamtrack.auto.boxes import overlap, touched_edges
+from streamtrack.auto.followed import Followed, Life
 from streamtrack.auto.places import (
     REST_PX,
     fill,

@@ -1,0 +1,76 @@
+"""Upright boxes (4,) x0, y0, x1, y1: their middles, sizes and how much of them is common."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from streamtrack import geometry
+from streamtrack.types import Matrix, Size
+
+Doubles: TypeAlias = npt.NDArray[np.float64]
+
+_EDGE_PX = 3.0
+
+
+class HasBox:
+    """What lies in a ``box``, pixels of the frame."""
+
+    __slots__ = ()
+    box: Doubles
+
+    @property
+    def center(self) -> Doubles:
+        return 0.5 * (self.box[:2] + self.box[2:])
+
+    @property
+    def size(self) -> Doubles:
+        return self.box[2:] - self.box[:2]
+
+
+def box_around(center: Doubles, size: Doubles) -> Doubles:
+    return np.concatenate([center - 0.5 * size, center + 0.5 * size])
+
+
+def moved_point(b_from_a: Matrix, point: Doubles) -> tuple[Doubles, float]:
+    """A point (2,) in the other picture, and how much larger things are there."""
+    moved = geometry.transform_points(b_from_a, point)[0].astype(np.float64)
+    if not np.isfinite(moved).all():
+        return point, 1.0
+    return moved, float(np.clip(geometry.local_scale(b_from_a, point), 0.5, 2.0))
+
+
+def moved_box(b_from_a: Matrix, box: Doubles) -> Doubles:
+    """A box in the other picture, upright as before."""
+    center, scale = moved_point(b_from_a, 0.5 * (box[:2] + box[2:]))
+    return box_around(center, scale * (box[2:] - box[:2]))
+
+
+def touched_edges(box: Doubles, size_wh: Size) -> npt.NDArray[np.bool_]:
+    """Which of the picture's edges (4,) left, top, right, bottom a box reaches."""
+    low = box[:2] <= _EDGE_PX - 0.5
+    high = box[2:] >= np.array(size_wh) - 0.5 - _EDGE_PX
+    return np.concatenate([low, high])
+
+
+def overlap(one: Doubles, other: Doubles) -> tuple[float, float]:
+    """Intersection of two boxes (4,) over their union, and over the first."""
+    x0, y0, x1, y1 = one.tolist()
+    u0, v0, u1, v1 = other.tolist()
+    width, height = min(x1, u1) - max(x0, u0), min(y1, v1) - max(y0, v0)
+    if width <= 0 or height <= 0:
+        return 0.0, 0.0
+    common, area = width * height, (x1 - x0) * (y1 - y0)
+    return common / (area + (u1 - u0) * (v1 - v0) - common), common / area
+
+
+def overlaps(ones: Doubles, others: Doubles) -> tuple[Doubles, Doubles]:
+    """`overlap` of each of the boxes (N, 4) with each of the others (M, 4), both (N, M)."""
+    low = np.maximum(ones[:, None, :2], others[None, :, :2])
+    high = np.minimum(ones[:, None, 2:], others[None, :, 2:])
+    common = np.prod(np.maximum(high - low, 0.0), axis=2)
+    area = np.prod(ones[:, 2:] - ones[:, :2], axis=1)[:, None]
+    other_area = np.prod(others[:, 2:] - others[:, :2], axis=1)[None]
+    return common / (area + other_area - common), common / area

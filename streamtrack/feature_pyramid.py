@@ -19,6 +19,8 @@ _MOST_LEVELS = 6
 _PART_PX = 160_000
 """About as much of the pyramid as is searched in one turn: half of a 640x480 picture."""
 
+_AT_ONCE_PX = 900_000
+
 
 @dataclass(frozen=True, slots=True)
 class Band:
@@ -29,11 +31,29 @@ class Band:
     end_row: int
 
 
-def part_of_pyramid(size_wh: Size, turn: int) -> list[Band]:
-    """What one turn of a search sees: all coarse parts in turn, then a fine one, and again."""
+def part_of_pyramid(size_wh: Size, turn: int | None) -> list[Band]:
+    """What one turn of a search sees: all coarse parts in turn, then a fine one, and again.
+
+    Turn None sees the coarse levels at once, as many as a search of 640x480 takes time for.
+    """
+    if turn is None:
+        return _at_once(size_wh)
     coarse, fine = _parts(size_wh)
     round_of_coarse, place = divmod(turn, len(coarse) + (1 if fine else 0))
     return coarse[place] if place < len(coarse) else fine[round_of_coarse % len(fine)]
+
+
+@cache
+def _at_once(size_wh: Size) -> list[Band]:
+    bands: list[Band] = []
+    area = 0
+    for number in range(level_count(size_wh) - 1, -1, -1):
+        width, height = _level_size(size_wh, number)
+        area += width * height
+        if bands and area > _AT_ONCE_PX:
+            break
+        bands.insert(0, Band(number, 0, height))
+    return bands
 
 
 @cache

@@ -105,8 +105,10 @@ class FeatureExtractor:
             return self._extract_from_pyramid(grey, mask)
         return self._extract_with_own_scale(grey, mask)
 
-    def extract_part(self, grey: Image, part: int) -> Features:
+    def extract_part(self, grey: Image, part: int | None) -> Features:
         """One of the parts of what `extract` would find, at little cost; ``part`` counts in turns.
+
+        Part None is what of all can be found at once in tolerable time.
 
         A part is one level of the pyramid, a band of a large one, or all the small ones together:
         a search over several frames sees everything, and no frame takes long. Detectors with a

@@ -24,7 +24,7 @@ class FrameView:
         self.pyramid = Pyramid(geometry.grey_of(frame.image))
         self._levels: ViewLevels | None = None
         self._features: Features | None = None
-        self._parts: dict[int, Features] = {}
+        self._parts: dict[int | None, Features] = {}
         self.detect_ms = 0.0
 
     @property
@@ -51,8 +51,11 @@ class FrameView:
             self.detect_ms += (time.perf_counter() - start) * 1e3
         return self._features
 
-    def part_of_features(self, part: int) -> Features:
-        """A part of the frame's features, in turns of ``part``; all if they are known already."""
+    def part_of_features(self, part: int | None) -> Features:
+        """A part of the frame's features, in turns of ``part``; all if they are known already.
+
+        Part None is nearly all of them (`FeatureExtractor.extract_part`).
+        """
         if self._features is not None:
             return self._features
         if part not in self._parts:

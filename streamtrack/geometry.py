@@ -41,6 +41,12 @@ def transform_points(b_from_a: Matrix, points: npt.ArrayLike) -> Points:
     return result
 
 
+def largest_shift(matrix: Matrix, quad: Points) -> float:
+    """How far the mapping moves the corner of the quad (4, 2) that it moves most, in x or y."""
+    moved = transform_points(matrix, quad) - quad
+    return float(np.abs(moved).max())
+
+
 def projective_depths(b_from_a: Matrix, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Third homogeneous coordinate (N,) of the mapped points: one sign means no fold-over."""
     pts = np.asarray(points, np.float64).reshape(-1, 2)

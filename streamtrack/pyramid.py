@@ -6,6 +6,8 @@ target that does not move stays where it is to the last hundredth of a pixel.
 
 from __future__ import annotations
 
+from math import log2
+
 import cv2
 import numpy as np
 
@@ -34,13 +36,16 @@ class Pyramid:
         """What a patch of ``size_wh`` sees of the picture, from the level of like resolution."""
         centre = np.array([size_wh[0] / 2, size_wh[1] / 2])
         picture_px = geometry.local_scale(picture_from_patch, centre)
-        octave = max(0, min(_MAX_OCTAVE, round(np.log2(max(picture_px, 1e-3)))))
+        octave = max(0, min(_MAX_OCTAVE, round(log2(max(picture_px, 1e-3)))))
         level = self._level(octave)
-        width, height = self.size_wh
-        level_from_picture = geometry.scaling(level.shape[1] / width, level.shape[0] / height)
+        level_from_patch = picture_from_patch
+        if octave:
+            width, height = self.size_wh
+            level_from_picture = geometry.scaling(level.shape[1] / width, level.shape[0] / height)
+            level_from_patch = level_from_picture @ picture_from_patch
         warped = cv2.warpPerspective(
             level,
-            level_from_picture @ picture_from_patch,
+            level_from_patch,
             size_wh,
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE,

@@ -71,7 +71,7 @@ def register(
         model, start, a, b, settings.inlier_threshold_px, effort.robust_rounds
     )
     inliers = int(np.count_nonzero(is_inlier))
-    verdict = _judge_support(a, is_inlier, settings, region, candidate_area_px)
+    verdict = judge_support(a, is_inlier, settings, region, candidate_area_px)
     if verdict is Verdict.OK:
         verdict = judge_mapping(b_from_a, region)
     if verdict is not Verdict.OK:
@@ -135,7 +135,7 @@ def _as_mask(mask: npt.NDArray[np.generic] | None, count: int) -> Mask:
 # -- the gate -----------------------------------------------------------------------------------
 
 
-def _judge_support(
+def judge_support(
     a: Points,
     is_inlier: Mask,
     settings: RegistrationSettings,

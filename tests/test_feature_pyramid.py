@@ -35,3 +35,13 @@ def test_a_shallow_pyramid_is_the_start_of_the_whole() -> None:
     for (a, a_matrix), (b, b_matrix) in zip(whole, shallow, strict=False):
         np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(a_matrix, b_matrix)
+
+
+@pytest.mark.parametrize("size_wh", [(640, 480), (1280, 720), (97, 61), (1920, 1080)])
+def test_what_is_seen_at_once_are_whole_coarse_levels_in_bounded_time(size_wh: Size) -> None:
+    heights = [len(level) for level, _ in pyramid(np.zeros((size_wh[1], size_wh[0]), np.uint8))]
+    bands = part_of_pyramid(size_wh, None)
+    numbers = [band.level for band in bands]
+    assert numbers == list(range(numbers[0], len(heights)))
+    assert all((b.first_row, b.end_row) == (0, heights[b.level]) for b in bands)
+    assert (numbers[0] == 0) == (size_wh[0] <= 640)

@@ -1,19 +1,26 @@
 """Is a target flat? A plane seen at a slant is still explained by one homography, a body is not.
 
 Turning in the picture plane, coming nearer and moving on prove nothing, as a body's picture does
-the same; so what is asked for is a pose that no similarity comes near.
+the same; so what is asked for is a pose that no similarity comes near. Until that is seen, looks
+decide: where a plane is partly hidden, what is left of it looks as well as ever, while a body that
+turns away becomes less like its first view wherever it still agrees with it.
 """
 
 from __future__ import annotations
+
+from math import isnan
 
 import numpy as np
 
 from streamtrack import geometry
 from streamtrack.fitting import fit, transfer_errors
+from streamtrack.tracking.alignment import CLEAR
 from streamtrack.types import Matrix, Model, Points
 
 _FLAT_IF = ((0.95, 0.01), (0.85, 0.03))  # share of points that agree, at a slant
 _FRAMES = 5  # like that
+_USUAL_RATE = 0.05  # share of a new frame in the usual correlation
+_AS_EVER = 0.03  # of correlation, below the usual one
 
 
 class Flatness:
@@ -22,13 +29,22 @@ class Flatness:
     def __init__(self, quad: Points) -> None:
         self._quad = quad
         self._frames = 0
+        self._usual = float("nan")
 
     @property
     def is_proven(self) -> bool:
         return self._frames >= _FRAMES
 
-    def learn(self, frame_from_template: Matrix, share: float) -> None:
-        """Take in a pose with which a ``share`` (0..1) of the points in view agree."""
+    @property
+    def least_correlation(self) -> float:
+        """Mean correlation of what agrees, from which on what does not agree is taken as hidden."""
+        return -1.0 if self.is_proven else self._usual - _AS_EVER
+
+    def learn(self, frame_from_template: Matrix, share: float, correlation: float) -> None:
+        """Take in a pose with which a ``share`` (0..1) of the points in view agree, that well."""
+        if share >= CLEAR:
+            usual = correlation if isnan(self._usual) else self._usual
+            self._usual = usual + _USUAL_RATE * (correlation - usual)
         if self.is_proven or share < _FLAT_IF[-1][0]:
             return
         seen_from = slant(frame_from_template, self._quad)

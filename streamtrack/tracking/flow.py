@@ -19,7 +19,23 @@ from streamtrack.fitting import fit, gauss_newton_step, poorest_model, transfer_
 from streamtrack.frame_view import FrameView
 from streamtrack.registration import Effort, judge_mapping, refused, register
 from streamtrack.settings import RegistrationSettings
+from streamtrack.tracking.alignment import (
+    CLEAR,
+    INLIER_PX,
+    MIN_CORRELATION,
+    MIN_VISIBLE_POINTS,
+    SEARCH_PX,
+    Alignment,
+    Hope,
+    agreeing_share,
+    patch_for,
+    points_in_view,
+    refusal,
+    surroundings,
+    withdrawn,
+)
 from streamtrack.tracking.blur import motion_blur, with_best_length
+from streamtrack.tracking.direct import SMEARING_PX, align_directly
 from streamtrack.tracking.likeness import local_correlation, matched_in_grey, moved_by
 from streamtrack.tracking.refine import Prior, refined
 from streamtrack.tracking.template import Patch, Template
@@ -27,14 +43,9 @@ from streamtrack.types import Image, Mask, Matrix, Model, Points, Registration, 
 
 Floats = npt.NDArray[np.float32]
 
-_MIN_CORRELATION = 0.5  # of a point's window, below which the point is no evidence
 _MIN_SUPPORTED_SHARE = 0.12  # of the points in view that must agree with the pose
-_MIN_VISIBLE_POINTS = 10
-_SEARCH_PX = 12.0  # how far, in patch pixels, a flow may reach: the area for chance agreement
-_INLIER_PX = 1.5  # patch pixels
-_SMEARING_PX = 8.0  # motion in a frame: less is hardly smeared
 _COARSE_STEPS = 2  # patches between the fine and the coarse alignment: half the resolution
-_CLEAR = 0.8  # share of the points in view that agree
+_WHOLE = 0.9  # share of all points that agreed, for a target that is seen as a whole
 _POINT_SIGMA_PX = 0.5  # patch pixels
 _HOLDING_STEPS = 2
 _BENT_INLIER_PX = 5.0  # patch pixels, from a similarity, for a target that is not flat
@@ -45,23 +56,6 @@ _QUICK = Effort((Model.AFFINE, Model.HOMOGRAPHY), 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Alignment:
-    """Where the template's textured points were found in a frame, and the pose they give.
-
-    is_in_view                     bool (P,), which of the patch's points are in view
-    template_points, frame_points  float32 (N, 2) of those that are
-    registration                   frame_from_template with its verdict
-    correlation                    mean local correlation of the points that support the pose
-    """
-
-    registration: Registration
-    is_in_view: Mask
-    template_points: Points
-    frame_points: Points
-    correlation: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Warp:
     """The frame seen through a pose as the patch would see it."""
 
@@ -69,18 +63,6 @@ class _Warp:
     frame_from_patch: Matrix
     frame_px: float
     visible: Mask
-
-
-@dataclass(frozen=True, slots=True)
-class Hope:
-    """What to expect of a guess that should be good.
-
-    share      of the points in view that then agree
-    motion_px  how far the target moves in a frame, which may smear it
-    """
-
-    share: float
-    motion_px: float
 
 
 class FlowAligner:
@@ -114,20 +96,23 @@ class FlowAligner:
     def align_near(
         self, view: FrameView, guess: Matrix, hope: Hope, sigma_px: float | None = None
     ) -> Alignment:
-        """The same from a guess that should be good, at half the cost: fine at once.
+        """The same from a guess that should be good: fine at once, and without flow if possible.
 
         Refused unless as much of the target agrees as was hoped for.
         """
         fine, coarse = self._patches_for(view, guess)
+        if hope.seen >= _WHOLE:
+            patches = fine, coarse
+            direct = align_directly(view, self._template, patches, self._settings, guess, hope)
+            if agreeing_share(direct) >= CLEAR:
+                return direct
         prior = None if sigma_px is None else Prior(guess, self._template.quad, sigma_px)
         found = self._flow_step(view, fine, guess, self._fine_flow, _QUICK, prior)
         if found.registration.b_from_a is None:
             return found
-        if agreeing_share(found) < hope.share:
-            is_inlier = found.registration.is_inlier
-            unlike = refused(Verdict.LOW_CORRELATION, len(is_inlier), is_inlier)
-            return replace(found, registration=unlike)
-        if hope.motion_px > _SMEARING_PX:
+        if not hope.is_met_by(found):
+            return withdrawn(found, Verdict.LOW_CORRELATION)
+        if hope.motion_px > SMEARING_PX:
             fine = _smeared_alike(view, fine, coarse, found)
         return self._refined(view, fine, found, prior)
 
@@ -144,7 +129,7 @@ class FlowAligner:
         sharp = self._flow_step(view, patch, guess, self._coarse_flow, _ROUGH, prior)
         pose = sharp.registration.b_from_a
         seen = _warp_back(view, patch, guess if pose is None else pose)
-        smear = motion_blur(patch.image, seen.image, _near(patch, seen.visible))
+        smear = motion_blur(patch.image, seen.image, surroundings(patch, seen.visible))
         if not smear.any():
             return sharp, smear
         smeared = self._flow_step(
@@ -154,7 +139,7 @@ class FlowAligner:
         if pose is None or smeared.registration.inliers < sharp.registration.inliers:
             return sharp, np.zeros(2)
         seen = _warp_back(view, patch, pose)
-        area = _near(patch, seen.visible)
+        area = surroundings(patch, seen.visible)
         return smeared, with_best_length(patch.image, seen.image, area, smear)
 
     def _refined(
@@ -164,9 +149,9 @@ class FlowAligner:
         registration = found.registration
         if registration.b_from_a is None or registration.model is None:
             return found
-        if registration.inliers > _CLEAR * len(found.is_in_view):
+        if registration.inliers > CLEAR * len(found.is_in_view):
             prior = None  # seen all around: it would change nothing
-        pose = refined(
+        better = refined(
             lambda pose: view.pyramid.warped(pose @ patch.template_from_patch, patch.size_wh),
             registration.b_from_a,
             patch.patch_from_template,
@@ -175,8 +160,9 @@ class FlowAligner:
             registration.model,
             None if prior is None else prior.against(agreeing_share(found)),
         )
-        if pose is None or judge_mapping(pose, self._template.quad) is not Verdict.OK:
-            pose = registration.b_from_a
+        pose = registration.b_from_a
+        if better is not None and judge_mapping(better.pose, self._template.quad) is Verdict.OK:
+            pose = better.pose
         errors = transfer_errors(pose, found.template_points, found.frame_points)
         rmse_px = float(np.sqrt(np.mean(errors[registration.is_inlier] ** 2)))
         model = registration.model
@@ -204,8 +190,8 @@ class FlowAligner:
         warp = _warp_back(view, patch, pose)
         visible = warp.visible
         template_points = patch.template_points[visible]
-        if np.count_nonzero(visible) < _MIN_VISIBLE_POINTS:
-            return _refusal(Verdict.OUT_OF_VIEW, visible, template_points)
+        if np.count_nonzero(visible) < MIN_VISIBLE_POINTS:
+            return refusal(Verdict.OUT_OF_VIEW, visible, template_points)
         image = matched_in_grey(warp.image, patch, visible)
         start = np.zeros((*image.shape, 2), np.float32)
         field = np.asarray(flow.calc(patch.image, image, start), np.float32)
@@ -213,7 +199,7 @@ class FlowAligner:
         moved = patch.points[visible] + field[rows, columns]
         frame_points = geometry.transform_points(warp.frame_from_patch, moved)
         correlation = local_correlation(patch, moved_by(image, field), rows, columns)
-        is_like = correlation >= _MIN_CORRELATION
+        is_like = correlation >= MIN_CORRELATION
         registration = self._estimate(patch, warp, moved, is_like, effort, prior)
         supported = registration.is_inlier
         share = np.count_nonzero(supported) / len(supported)
@@ -235,13 +221,13 @@ class FlowAligner:
 
         The model is that of the remaining motion: what the guess had of richer models stays.
         """
-        settings = self._settings.model_copy(update={"inlier_threshold_px": _INLIER_PX})
+        settings = self._settings.model_copy(update={"inlier_threshold_px": INLIER_PX})
         found = register(
             patch.points[warp.visible][is_like],
             moved[is_like],
             settings,
             geometry.transform_points(patch.patch_from_template, self._template.quad),
-            (2 * _SEARCH_PX) ** 2,
+            (2 * SEARCH_PX) ** 2,
             effort,
         )
         # Not for a target that comes back: what agrees so loosely would be thin evidence.
@@ -252,7 +238,7 @@ class FlowAligner:
                 moved[is_like],
                 settings.model_copy(update=loose),
                 geometry.transform_points(patch.patch_from_template, self._template.quad),
-                (2 * _SEARCH_PX) ** 2,
+                (2 * SEARCH_PX) ** 2,
                 effort,
             )
         is_inlier = np.zeros(len(moved), np.bool_)
@@ -260,7 +246,7 @@ class FlowAligner:
         if found.b_from_a is None:
             return replace(found, is_inlier=is_inlier)
         seen_from_patch = found.b_from_a
-        if prior is not None and found.model is not None and np.mean(is_inlier) < _CLEAR:
+        if prior is not None and found.model is not None and np.mean(is_inlier) < CLEAR:
             pairs = patch.points[warp.visible][is_inlier], moved[is_inlier]
             held = prior.against(float(np.mean(is_inlier)))
             seen_from_patch = _held_by(held, found.model, *pairs, patch, warp)
@@ -305,32 +291,6 @@ def _held_by(
     return mapping
 
 
-def agreeing_share(alignment: Alignment) -> float:
-    """Share (0..1) of the points in view that agree with the pose; 0 if it was refused."""
-    found = alignment.registration
-    if found.b_from_a is None or not len(found.is_inlier):
-        return 0.0
-    return found.inliers / len(found.is_inlier)
-
-
-def _near(patch: Patch, rows: Mask) -> Mask:
-    """The surroundings (h, w) of some of the patch's points."""
-    columns, lines = patch.points[rows].astype(np.intp).T
-    near = np.zeros(patch.image.shape, np.uint8)
-    near[lines, columns] = 1
-    around: Mask = cv2.dilate(near, np.ones((9, 9), np.uint8)) > 0
-    return around
-
-
-def patch_for(template: Template, frame_from_template: Matrix) -> int:
-    """Index of the patch whose resolution fits the target's size in the frame."""
-    magnification = geometry.local_scale(frame_from_template, template.centre)
-    for i, patch in enumerate(template.patches):
-        if patch.scale <= 1.2 * magnification:
-            return i
-    return len(template.patches) - 1
-
-
 def _make_flow() -> cv2.DISOpticalFlow:
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     flow.setFinestScale(1)
@@ -341,33 +301,17 @@ def _make_flow() -> cv2.DISOpticalFlow:
     return flow
 
 
-def _warp_back(view: FrameView, patch: Patch, pose: Matrix) -> _Warp:
-    height, width = patch.image.shape
-    frame_from_patch = pose @ patch.template_from_patch
-    frame_px = geometry.local_scale(frame_from_patch, np.array([width / 2, height / 2]))
-    in_frame = geometry.transform_points(frame_from_patch, patch.points)
-    frame_width, frame_height = view.size_wh
-    reach = 3 * frame_px
-    visible = (
-        (in_frame[:, 0] >= reach)
-        & (in_frame[:, 1] >= reach)
-        & (in_frame[:, 0] < frame_width - reach)
-        & (in_frame[:, 1] < frame_height - reach)
-    )
-    image = view.pyramid.warped(frame_from_patch, (width, height))
-    return _Warp(image, frame_from_patch, frame_px, visible)
-
-
 def _smeared_alike(view: FrameView, patch: Patch, coarse: Patch, found: Alignment) -> Patch:
     """The patch under the motion blur under which it was found, judged at lower resolution."""
     pose = found.registration.b_from_a
     assert pose is not None
     seen = _warp_back(view, coarse, pose)
-    smear = motion_blur(coarse.image, seen.image, _near(coarse, seen.visible))
+    smear = motion_blur(coarse.image, seen.image, surroundings(coarse, seen.visible))
     return patch.smeared(smear * (patch.scale / coarse.scale)) if smear.any() else patch
 
 
-def _refusal(verdict: Verdict, in_view: Mask, template_points: Points) -> Alignment:
-    unknown = np.full_like(template_points, np.nan)
-    registration = refused(verdict, len(template_points))
-    return Alignment(registration, in_view, template_points, unknown, float("nan"))
+def _warp_back(view: FrameView, patch: Patch, pose: Matrix) -> _Warp:
+    frame_from_patch = pose @ patch.template_from_patch
+    visible = points_in_view(view, patch, pose)
+    image = view.pyramid.warped(frame_from_patch, patch.size_wh)
+    return _Warp(image, frame_from_patch, patch.frame_px(pose), visible)

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from streamtrack.tracking.template import CORRELATION_WINDOW, Patch
+from streamtrack.tracking.refine import contrast_gain
+from streamtrack.tracking.template import CORRELATION_WINDOW, Patch, window_means
 from streamtrack.types import Image, Mask
 
 Floats = npt.NDArray[np.float32]
@@ -75,3 +76,20 @@ def local_correlation(patch: Patch, seen: Image, rows: Rows, columns: Rows) -> F
     variance = square - mean * mean + _NOISE_VARIANCE
     scale = np.sqrt((patch_variance + _NOISE_VARIANCE) * variance)
     return np.asarray(covariance / scale, np.float32)
+
+
+def shift_left(patch: Patch, smooth: Floats, rows: Rows, columns: Rows, visible: Mask) -> Floats:
+    """By how many pixels (N, 2) the windows around the visible points of a patch are still off.
+
+    One step of Lucas & Kanade (1981) with the template's gradients; ``smooth`` (h, w) is the frame
+    warped back and high-passed.
+    """
+    ours = patch.gradients
+    contrast = float(np.median(np.abs(ours.smooth[rows, columns])))
+    residual = contrast_gain(contrast, smooth[rows, columns]) * smooth - ours.smooth
+    x, y = (
+        window_means(np.asarray(cv2.multiply(gradient, residual), np.float32))[rows, columns]
+        for gradient in (ours.gx, ours.gy)
+    )
+    (xx, xy), (_, yy) = patch.softness[visible].transpose(1, 2, 0)
+    return -np.stack([xx * x + xy * y, xy * x + yy * y], axis=1)

@@ -16,7 +16,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from streamtrack.geometry import image_quad, inverted, local_scale, normalized, transform_points
+from streamtrack.geometry import (
+    image_quad,
+    inverted,
+    largest_shift,
+    local_scale,
+    normalized,
+    transform_points,
+)
 from streamtrack.types import Image, Mask, Matrix, Model, Points
 
 Floats = npt.NDArray[np.float32]
@@ -28,7 +35,8 @@ _MIN_PIXELS = 150
 _MIN_GRADIENT = 1.0
 _HIGH_PASS_PX = 17
 _ROUNDS = 4
-_CONVERGED_PX = 0.04
+CONVERGED_PX = 0.04
+"""Patch pixels."""
 _MAX_MOVE_SHARE = 0.1
 _SAMPLE_STEP = 4
 
@@ -57,12 +65,16 @@ class Gradients:
     values           float32 (N,), high-passed grey values there
     jacobian         float32 (N, 8), change of a value with each parameter of a homography
     unit_from_patch  the coordinates in which those parameters are well scaled
+    smooth, gx, gy   float32 (h, w), the high-passed patch and its derivatives a pixel
     """
 
     index: npt.NDArray[np.intp]
     values: Floats
     jacobian: Floats
     unit_from_patch: Matrix
+    smooth: Floats
+    gx: Floats
+    gy: Floats
 
 
 def make_gradients(image: Image, inside: Mask) -> Gradients:
@@ -93,6 +105,21 @@ class Prior:
         return replace(self, sigma_px=self.sigma_px * trust)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Refinement:
+    """A refined pose (frame_from_template), and the last look at the frame that led to it.
+
+    seen_through  the pose that was looked through
+    seen          (h, w), the frame as the patch sees it through that
+    smooth        float32 (h, w), the same high-passed
+    """
+
+    pose: Matrix
+    seen_through: Matrix
+    seen: Image
+    smooth: Floats
+
+
 def refined(
     warp_back: Callable[[Matrix], Image],
     pose: Matrix,
@@ -101,26 +128,34 @@ def refined(
     support: Mask,
     model: Model,
     prior: Prior | None,
-) -> Matrix | None:
+    converged_px: float = CONVERGED_PX,
+) -> Refinement | None:
     """``pose`` (frame_from_template) moved to where the grey values fit best, or None.
 
     ``warp_back`` gives the frame as the patch (h, w) would see it through a pose, ``support``
     (N,) tells which of the gradients' pixels show the target. None if there are too few of
-    them, or if the alignment runs away: the caller then keeps what it has.
+    them, or if the alignment runs away: the caller then keeps what it has. A step that moves no
+    corner of the patch by ``converged_px`` is the last.
     """
     if np.count_nonzero(support) < _MIN_PIXELS:
         return None
-    index, values = gradients.index[support], gradients.values[support]
+    index, values, jacobian = gradients.index, gradients.values, gradients.jacobian
+    if not support.all():
+        index, values, jacobian = index[support], values[support], jacobian[support]
     basis = _BASES[model]
-    jacobian = gradients.jacobian[support] @ basis.astype(np.float32)
+    if model is not Model.HOMOGRAPHY:
+        jacobian = jacobian @ basis.astype(np.float32)
     unit_from_patch = gradients.unit_from_patch
     patch_from_unit = inverted(unit_from_patch)
     template_from_patch = inverted(patch_from_template)
     expected = _expectation(prior, pose, unit_from_patch @ patch_from_template) if prior else None
+    contrast = _median_size(values)
     moved_px = 0.0
-    for _ in range(_ROUNDS):
-        image = warp_back(pose)
-        normal, gradient = _normal_equations(jacobian, values, _high_passed(image).ravel()[index])
+    for left in reversed(range(_ROUNDS)):
+        seen_through, image = pose, warp_back(pose)
+        smooth = _high_passed(image)
+        seen = smooth.ravel().take(index)
+        normal, gradient = _normal_equations(jacobian, values, contrast, seen)
         if expected is not None:
             normal = normal + basis.T @ expected.normal @ basis
             gradient = gradient + basis.T @ expected.gradient(pose)
@@ -130,27 +165,36 @@ def refined(
             return None
         unit_step = np.eye(3) + np.append(basis @ step, 0.0).reshape(3, 3)
         patch_step = patch_from_unit @ unit_step @ unit_from_patch
-        corners = image_quad((image.shape[1], image.shape[0]))
-        change_px = float(np.abs(transform_points(patch_step, corners) - corners).max())
+        change_px = largest_shift(patch_step, image_quad((image.shape[1], image.shape[0])))
         moved_px += change_px
         if not moved_px < _MAX_MOVE_SHARE * max(image.shape):
             return None
         pose = pose @ template_from_patch @ inverted(patch_step) @ patch_from_template
-        if change_px < _CONVERGED_PX:
-            break
-    return normalized(pose)
+        if change_px < converged_px or not left:
+            return Refinement(normalized(pose), seen_through, image, smooth)
+    return None
 
 
-def _normal_equations(jacobian: Floats, values: Floats, seen: Floats) -> tuple[Doubles, Doubles]:
+def contrast_gain(contrast: float, seen: Floats) -> np.float32:
+    """What the high-passed values ``seen`` are to be multiplied by, to be like the template's."""
+    gain = (contrast + 1) / (_median_size(seen) + 1)
+    return np.float32(min(3.0, max(0.4, gain)))
+
+
+def _normal_equations(
+    jacobian: Floats, values: Floats, contrast: float, seen: Floats
+) -> tuple[Doubles, Doubles]:
     """Information matrix and vector of the warp that takes the template's values to those seen."""
-    gain = (_median_size(values) + 1) / (_median_size(seen) + 1)
-    residual = np.float32(min(3.0, max(0.4, gain))) * seen - values
+    residual = contrast_gain(contrast, seen) * seen - values
     noise = 1.4826 * _median_size(residual) + 1.0
-    weights = np.maximum(0, 1 - (residual * np.float32(1 / (4.685 * noise))) ** 2) ** 2
-    weighted = jacobian * (weights * np.float32(1 / noise**2))[:, None]
-    normal = (weighted.T @ jacobian).astype(np.float64)
+    weights = 1 - (residual * np.float32(1 / (4.685 * noise))) ** 2
+    np.maximum(weights, 0, out=weights)
+    weights *= weights
+    weights *= np.float32(1 / noise**2)
+    weighted = (jacobian * weights[:, None]).T
+    normal = (weighted @ jacobian).astype(np.float64)
     normal[np.diag_indices(len(normal))] *= 1 + 1e-6
-    return normal, (weighted.T @ residual).astype(np.float64)
+    return normal, (weighted @ residual).astype(np.float64)
 
 
 def _median_size(values: Floats) -> float:
@@ -219,6 +263,9 @@ def _gradients_at(index: npt.NDArray[np.intp], smooth: Floats, gx: Floats, gy: F
         smooth.ravel()[index],
         _jacobian(gx.ravel()[index] / unit, gy.ravel()[index] / unit, x, y),
         unit_from_patch,
+        smooth,
+        gx,
+        gy,
     )
 
 
@@ -232,8 +279,11 @@ def _informative(strength: Floats, inside: Mask) -> npt.NDArray[np.intp]:
     """Places of the strongest gradients, each judged against its surroundings."""
     strength = np.where(inside, strength, np.float32(0))
     around = cv2.blur(strength, (31, 31)) + 1.0
-    order = np.argsort(-(strength / np.sqrt(around)).ravel(), kind="stable")[:_PIXELS]
-    return np.sort(order[strength.ravel()[order] > _MIN_GRADIENT])
+    against_surroundings = (strength / np.sqrt(around)).ravel()
+    best = np.arange(strength.size)
+    if strength.size > _PIXELS:
+        best = np.sort(np.argpartition(-against_surroundings, _PIXELS)[:_PIXELS])
+    return best[strength.ravel()[best] > _MIN_GRADIENT]
 
 
 def _jacobian(

@@ -23,7 +23,7 @@ CORRELATION_WINDOW = 11
 _MAX_ENLARGEMENT = 2.0
 _SCALE_STEP = 2**-0.5
 _MOST_SCALES = 12
-_PASSING_SCALES = 4
+_PASSING_SCALES = 3
 _MIN_PATCH_SIDE_PX = 28
 _FLOW_POINTS = 260
 MIN_FLOW_POINTS = 12
@@ -32,6 +32,7 @@ _EDGE_PX = 9
 _MARGIN_SHARE = 0.06
 _MIN_GRADIENT = 2.0
 """Grey levels per pixel in the weaker direction; noise of sigma 3 gives about 1.3."""
+_LEAST_STIFFNESS = 1e-3
 _FEATURE_BORDER_PX = 48
 _SURROUNDINGS_SHARE = 0.03
 
@@ -56,7 +57,10 @@ class Patch:
     gradients            the pixels on which a pose is refined
     nearest_point        int (gradient pixels,), row of the point nearest to each of them
     windows              what the image's correlation with another needs of it
+    softness             float32 (N, 2, 2), by how much each point's window is off per grey value:
+                         the inverse of its mean structure tensor
     template_from_patch  the inverse of patch_from_template
+    middle               float64 (2,), the patch's centre in template pixels
     """
 
     image: Image
@@ -67,7 +71,9 @@ class Patch:
     gradients: Gradients
     nearest_point: npt.NDArray[np.intp]
     windows: Windows
+    softness: npt.NDArray[np.float32]
     template_from_patch: Matrix
+    middle: npt.NDArray[np.float64]
 
     @property
     def size_wh(self) -> Size:
@@ -77,7 +83,14 @@ class Patch:
         """The patch under a motion blur ``vector`` (2,), in patch pixels."""
         image = smeared_along(self.image, vector)
         gradients = changed_gradients(self.gradients, image)
-        return replace(self, image=image, gradients=gradients, windows=_windows(image))
+        softness = _softness(gradients, self.points)
+        return replace(
+            self, image=image, gradients=gradients, windows=_windows(image), softness=softness
+        )
+
+    def frame_px(self, frame_from_template: Matrix) -> float:
+        """Frame pixels that one pixel of the patch is wide at its centre."""
+        return geometry.local_scale(frame_from_template, self.middle) / self.scale
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,25 +129,24 @@ def make_template(name: str, picture: Image, quad: Points, extractor: FeatureExt
 
 def make_patches(grey: Image, quad: Points) -> tuple[Patch, ...]:
     """The target inside ``quad`` of a grey picture (H, W) at all its scales, finest first."""
-    return _patches(grey, quad, None, _MAX_ENLARGEMENT, _MOST_SCALES)
+    return _patches(Pyramid(grey), quad, None, _MAX_ENLARGEMENT, _MOST_SCALES)
 
 
-def make_passing_patches(grey: Image, quad: Points, shown: Points) -> tuple[Patch, ...]:
+def make_passing_patches(pyramid: Pyramid, quad: Points, shown: Points) -> tuple[Patch, ...]:
     """The same at the few scales needed as long as the target's size hardly changes.
 
     Only the surroundings of ``shown`` (N, 2) are compared.
     """
-    return _patches(grey, quad, shown, 1.0, _PASSING_SCALES)
+    return _patches(pyramid, quad, shown, 1.0, _PASSING_SCALES)
 
 
 def _patches(
-    grey: Image, quad: Points, shown: Points | None, finest: float, most: int
+    pyramid: Pyramid, quad: Points, shown: Points | None, finest: float, most: int
 ) -> tuple[Patch, ...]:
     x0, y0, x1, y1 = geometry.bounding_box(quad)
     margin = max(2.0, _MARGIN_SHARE * max(x1 - x0, y1 - y0))
     x0, y0, x1, y1 = x0 - margin, y0 - margin, x1 + margin, y1 + margin
     finest = min(finest, (PATCH_AREA_PX / ((x1 - x0) * (y1 - y0))) ** 0.5)
-    pyramid = Pyramid(grey)
     patches: list[Patch] = []
     for step in range(most):
         scale = finest * _SCALE_STEP**step
@@ -176,7 +188,9 @@ def _make_patch(
         gradients,
         _nearest_rows(points, gradients.index, size),
         _windows(image),
+        _softness(gradients, points),
         template_from_patch,
+        geometry.transform_points(template_from_patch, [[size[0] / 2, size[1] / 2]])[0],
     )
 
 
@@ -185,6 +199,21 @@ def _windows(image: Image) -> Windows:
     mean = np.asarray(cv2.boxFilter(image, cv2.CV_32F, window), np.float32)
     square = np.asarray(cv2.sqrBoxFilter(image, cv2.CV_32F, window), np.float32)
     return Windows(mean, square - mean * mean)
+
+
+def _softness(gradients: Gradients, points: Points) -> npt.NDArray[np.float32]:
+    columns, rows = points.astype(np.intp).T
+    gx, gy = gradients.gx, gradients.gy
+    xx, xy, yy = (window_means(a * b)[rows, columns] for a, b in ((gx, gx), (gx, gy), (gy, gy)))
+    determinant = np.maximum(xx * yy - xy * xy, _LEAST_STIFFNESS)
+    inverse = np.stack([yy, -xy, -xy, xx], axis=1) / determinant[:, None]
+    return np.asarray(inverse.reshape(-1, 2, 2), np.float32)
+
+
+def window_means(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Mean (h, w) of the values in the window around each pixel."""
+    window = (CORRELATION_WINDOW, CORRELATION_WINDOW)
+    return np.asarray(cv2.boxFilter(values, cv2.CV_32F, window), np.float32)
 
 
 def _nearest_rows(points: Points, index: npt.NDArray[np.intp], size: Size) -> npt.NDArray[np.intp]:

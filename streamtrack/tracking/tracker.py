@@ -9,18 +9,16 @@ neither ever repeats an old quad.
 
 from __future__ import annotations
 
-from dataclasses import replace
-from math import sqrt
 from typing import Protocol
 
 import numpy as np
 
 from streamtrack import geometry
-from streamtrack.fitting import fit
 from streamtrack.frame_view import FrameView
 from streamtrack.matching import match, match_guided
 from streamtrack.registration import refused, register
 from streamtrack.settings import Settings
+from streamtrack.tracking.alignment import CLEAR, Alignment, Hope, agreeing_share, withdrawn
 from streamtrack.tracking.appearance import (
     MAX_CHROMA_DISTANCE,
     MAX_CHROMA_DISTANCE_OTHER_CAMERA,
@@ -28,7 +26,8 @@ from streamtrack.tracking.appearance import (
     prepare_colors,
 )
 from streamtrack.tracking.flatness import Flatness
-from streamtrack.tracking.flow import Alignment, FlowAligner, Hope, agreeing_share
+from streamtrack.tracking.flow import FlowAligner
+from streamtrack.tracking.prediction import Prediction
 from streamtrack.tracking.template import Template
 from streamtrack.tracking.views import MIN_VIEW_SHARE, RecentViews
 from streamtrack.types import (
@@ -37,7 +36,6 @@ from streamtrack.types import (
     Matches,
     Matrix,
     Model,
-    Points,
     Registration,
     Track,
     TrackState,
@@ -49,16 +47,13 @@ _COAST_FRAMES = 10  # lost frames in which the last pose is still tried
 _MAX_AREA_JUMP = 1.5  # from the prediction to what is found
 _MIN_RETURN_SHARE = 0.3  # of the points in view, for a target that was lost
 _FULL_SEARCH_EVERY = 24  # searches: less than 5 in 100 frames take longer
-_FIRST_SURPRISE_PX = 5.0
 _MIN_SURPRISE_PX = 2.0
 _THIN_SHARE = 0.33  # inliers of all points, below which hidden corners go by prediction
 _MAX_DOUBT_PX = 8.0  # how far off hidden corners may be thought to be
 _CALM_SURPRISE_PX = 3.0  # of a guess that is tried at once
 _CALM_SURPRISE_FLAT_PX = 4.5
-_HOPED_SHARE = 0.8  # of the points in view that agree if the guess was good
 _LEAST_HOPED_SHARE = 0.35
 _SHARE_KEPT = 0.85  # of the last frame's, where less agree of what is flat: an occluder stays
-_SURPRISE_RATE = 0.2  # share of a new frame's surprise in the running mean
 _CLEAR_VIEW_SHARE = 0.5  # inliers of all points, below which a frame teaches no surprise
 _REMEMBERED_SHARE = 0.4  # of the points in view, for a frame to be a recent view
 _VIEW_ADVANTAGE = 0.3  # in share of points, of a recent view over the first
@@ -115,13 +110,14 @@ class HybridTracker:
         self._flatness = Flatness(template.quad)
         self._frames_to_next_view = 0
         self._uses_views = settings.registration.model == "auto"
-        self._pose = first_pose
-        self._step_pose: Matrix | None = None
+        only_shifts = settings.registration.model == "translation"
+        step_model = Model.TRANSLATION if only_shifts else Model.SIMILARITY
+        self._prediction = Prediction(template.quad, step_model, first_pose)
         self._frames_lost = 0
         self._searches = 0
-        self._surprise_px = _FIRST_SURPRISE_PX
         self._doubt_px = 0.0
         self._last_share = 0.0
+        self._last_seen = 0.0
         self._was_seen = first_pose is not None
         is_same_camera = first_pose is not None
         self._max_chroma_distance = (
@@ -131,25 +127,29 @@ class HybridTracker:
 
     def update(self, view: FrameView) -> Track:
         was_in_view = self._is_in_view
+        self._views.was_made_now = False
         followed = self._follow(view)
         recent = self._follow_views(view, followed)
         if recent is not None:
             return self._tracked(recent, "view")
         if was_in_view and followed is not None and followed.registration.b_from_a is None:
             followed = self._follow(view)
-        if followed is not None and followed.registration.b_from_a is not None:
-            self._flatness.learn(followed.registration.b_from_a, agreeing_share(followed))
-            if self._flatness.is_proven or agreeing_share(followed) >= _REMEMBERED_SHARE:
+        pose = None if followed is None else followed.registration.b_from_a
+        if followed is not None and pose is not None:
+            share = agreeing_share(followed)
+            self._flatness.learn(pose, share, followed.correlation)
+            if self._flatness.is_proven or share >= _REMEMBERED_SHARE:
                 self._views.remember(view, followed)
             return self._tracked(followed, "flow")
         self._views.forget()
-        if not self._is_searched_in(view):
+        # Making a view takes as long as a search: not both in one frame.
+        if self._views.was_made_now or not self._is_searched_in(view):
             return self._not_searched(followed)
         detected, evidence, means = self._detect(view)
         if detected.b_from_a is not None:
             confirmed = self._aligner.align(view, detected.b_from_a)
             if agreeing_share(confirmed) < _MIN_RETURN_SHARE:
-                confirmed = _refused(confirmed, Verdict.LOW_CORRELATION)
+                confirmed = withdrawn(confirmed, Verdict.LOW_CORRELATION)
             confirmed = self._with_own_colors(confirmed, view)
             if confirmed.registration.verdict is Verdict.OK:
                 return self._tracked(confirmed, means)
@@ -159,7 +159,7 @@ class HybridTracker:
         return make_track(self.template, verdict, evidence, means, self._was_seen)
 
     def forget_place(self) -> None:
-        self._pose = self._step_pose = None
+        self._prediction.forget()
         self._frames_lost = 1
         self._views.forget()
 
@@ -173,7 +173,7 @@ class HybridTracker:
     def _coasts(self) -> bool:
         """Is this one of the frames in which a target is tried at its last place?"""
         is_turn = self._frames_lost % 2 == 0
-        return self._pose is not None and is_turn and self._frames_lost <= _COAST_FRAMES
+        return self._prediction.pose is not None and is_turn and self._frames_lost <= _COAST_FRAMES
 
     def _not_searched(self, followed: Alignment | None) -> Track:
         self._frames_lost += 1
@@ -182,21 +182,24 @@ class HybridTracker:
         return make_track(self.template, found, Evidence(), "flow", self._was_seen)
 
     def _follow(self, view: FrameView) -> Alignment | None:
-        if self._pose is None or not self._coasts():
+        if self._prediction.pose is None or not self._coasts():
             return None
-        guess = self._pose if self._step_pose is None else self._step_pose @ self._pose
+        guess = self._prediction.guess
         followed = self._plausible(self._align_first(view, guess), guess)
         found = followed.registration
         if found.b_from_a is not None and self._frames_lost == 0:
-            share = np.count_nonzero(found.is_inlier) / len(followed.is_in_view)
+            share = found.inliers / len(followed.is_in_view)
             if share >= _CLEAR_VIEW_SHARE:
-                self._learn_surprise(guess, found.b_from_a)
                 self._doubt_px = 0.0
             elif share < _THIN_SHARE:
-                self._doubt_px = float(np.hypot(self._doubt_px, self._surprise_px))
+                self._doubt_px = float(np.hypot(self._doubt_px, self._sigma_px))
                 if self._doubt_px > _MAX_DOUBT_PX:
-                    followed = _refused(followed, Verdict.MOSTLY_HIDDEN)
+                    followed = withdrawn(followed, Verdict.MOSTLY_HIDDEN)
         return followed if self._frames_lost == 0 else self._with_own_colors(followed, view)
+
+    def _is_clear(self, alignment: Alignment) -> bool:
+        """Is so much of the target seen that the frame teaches how good predictions are?"""
+        return alignment.registration.inliers >= _CLEAR_VIEW_SHARE * len(alignment.is_in_view)
 
     def _align_first(self, view: FrameView, guess: Matrix) -> Alignment:
         """The first view in the frame: near the guess if that should be good, else farther off.
@@ -205,31 +208,43 @@ class HybridTracker:
         """
         if self._frames_lost:
             return self._aligner.align(view, guess)
-        hope = Hope(_CLEAR_VIEW_SHARE, 0.0) if self._is_in_view else self._hope(guess)
+        if self._is_in_view:
+            off_px = self._prediction.surprise_px
+            return self._aligner.align_near(
+                view, guess, Hope(_CLEAR_VIEW_SHARE, -1.0, 0.0, 0.0, off_px)
+            )
+        hope = self._hope()
         if hope is not None:
-            near = self._aligner.align_near(view, guess, hope, self._surprise_px)
-            if near.registration.b_from_a is not None or self._is_in_view:
+            near = self._aligner.align_near(view, guess, hope, self._sigma_px)
+            if near.registration.b_from_a is not None:
                 return near
-        return self._aligner.align(view, guess, self._surprise_px)
+        return self._aligner.align(view, guess, self._sigma_px)
 
     def _follow_views(self, view: FrameView, followed: Alignment | None) -> Alignment | None:
         """The pose by how the target looked lately, where the first view does not explain it."""
-        if not self._uses_views or self._pose is None or self._frames_lost or followed is None:
+        if (
+            not self._uses_views
+            or self._prediction.pose is None
+            or self._frames_lost
+            or followed is None
+        ):
             return None
         first_share = agreeing_share(followed)
         if first_share >= _CLEAR_VIEW_SHARE:
             self._is_in_view = False
             self._frames_to_next_view = 0
             return None
-        if self._flatness.is_proven and followed.registration.b_from_a is not None:
+        is_plane = self._flatness.is_proven or first_share >= _MIN_RETURN_SHARE
+        looks_as_ever = followed.correlation >= self._flatness.least_correlation
+        if first_share > 0 and is_plane and looks_as_ever:
             return None
         if self._frames_to_next_view and followed.registration.b_from_a is not None:
             self._frames_to_next_view -= 1
             return None
-        guess = self._pose if self._step_pose is None else self._step_pose @ self._pose
+        guess = self._prediction.guess
         if self._flatness.is_proven:
             self._views.take_as_flat()
-        recent = self._views.align(view, guess, self._surprise_px)
+        recent = self._views.align(view, guess, self._sigma_px)
         if recent is None:
             return None
         recent = self._with_own_colors(self._plausible(recent, guess), view)
@@ -244,15 +259,18 @@ class HybridTracker:
             self._views.renew()
         return recent
 
-    def _hope(self, guess: Matrix) -> Hope | None:
+    def _hope(self) -> Hope | None:
         """What to expect of the guess, if the target was well predicted in the last frames."""
         most_px = _CALM_SURPRISE_FLAT_PX if self._flatness.is_proven else _CALM_SURPRISE_PX
-        if self._pose is None or self._surprise_px > most_px:
+        if self._prediction.surprise_px > most_px:
             return None
-        share = _HOPED_SHARE
-        if self._flatness.is_proven:
-            share = max(_LEAST_HOPED_SHARE, min(share, _SHARE_KEPT * self._last_share))
-        return Hope(share, _rms_distance_px(guess, self._pose, self.template.quad))
+        return Hope(
+            max(_LEAST_HOPED_SHARE, min(CLEAR, _SHARE_KEPT * self._last_share)),
+            self._flatness.least_correlation,
+            self._last_seen,
+            self._prediction.motion_px,
+            self._prediction.surprise_px,
+        )
 
     def _plausible(self, alignment: Alignment, guess: Matrix) -> Alignment:
         """The alignment, refused if the target jumped in size, or came back on thin evidence."""
@@ -268,13 +286,12 @@ class HybridTracker:
             verdict = Verdict.AREA
         elif self._frames_lost and agreeing_share(alignment) < _MIN_RETURN_SHARE:
             verdict = Verdict.LOW_CORRELATION
-        return alignment if verdict is Verdict.OK else _refused(alignment, verdict)
+        return alignment if verdict is Verdict.OK else withdrawn(alignment, verdict)
 
-    def _learn_surprise(self, expected: Matrix, found: Matrix) -> None:
-        """How far the corners are from their prediction, averaged over the last frames."""
-        surprise_px = _rms_distance_px(expected, found, self.template.quad)
-        self._surprise_px += _SURPRISE_RATE * (surprise_px - self._surprise_px)
-        self._surprise_px = max(self._surprise_px, _MIN_SURPRISE_PX)
+    @property
+    def _sigma_px(self) -> float:
+        """How far off its prediction a corner is taken to be, where nothing else tells."""
+        return max(self._prediction.surprise_px, _MIN_SURPRISE_PX)
 
     def _with_own_colors(self, alignment: Alignment, view: FrameView) -> Alignment:
         """The alignment, refused if what it found has other colours than the target."""
@@ -289,21 +306,21 @@ class HybridTracker:
             _COLOR_REACH_SHARE * float(np.sqrt(abs(geometry.signed_area(self.template.quad)))),
         )
         is_like = distance <= self._max_chroma_distance
-        return alignment if is_like else _refused(alignment, Verdict.OTHER_COLORS)
+        return alignment if is_like else withdrawn(alignment, Verdict.OTHER_COLORS)
 
     def _detect(self, view: FrameView) -> tuple[Registration, Evidence, str]:
         """By features: near the last place in the first search, then everywhere.
 
         Once the target was seen, most searches see only a part of the frame's features, so that
-        they do not take long; a few see all, for a target that no part is enough to find.
+        they do not take long; a few see nearly all, for a target that no part is enough to find.
         """
         is_turn = self._searches % _FULL_SEARCH_EVERY == _FULL_SEARCH_EVERY - 1
-        sees_all = is_turn or not self._was_seen
-        features = view.features() if sees_all else view.part_of_features(self._searches)
+        part = None if is_turn else self._searches
+        features = view.part_of_features(part) if self._was_seen else view.features()
         self._searches += 1
         template, matching = self.template.features, self._settings.matching
-        if self._pose is not None and self._frames_lost == 0:
-            predicted = geometry.transform_points(self._pose, template.points)
+        if self._prediction.pose is not None and self._frames_lost <= 1:
+            predicted = geometry.transform_points(self._prediction.pose, template.points)
             matches = match_guided(template, features, predicted, _GUIDED_RADIUS_PX, matching)
             found, evidence = _register_features(
                 self.template, view, features, matches, self._settings
@@ -317,47 +334,21 @@ class HybridTracker:
     def _tracked(self, alignment: Alignment, means: str) -> Track:
         found = alignment.registration
         assert found.b_from_a is not None
-        if self._pose is not None and self._frames_lost == 0 and means in ("flow", "view"):
-            only_shifts = self._settings.registration.model == "translation"
-            model = Model.TRANSLATION if only_shifts else Model.SIMILARITY
-            self._step_pose = _shared_motion(model, self.template.quad, self._pose, found.b_from_a)
+        share = agreeing_share(alignment)
+        if self._frames_lost == 0 and means in ("flow", "view"):
+            is_clear = means == "flow" and self._is_clear(alignment)
+            self._prediction.follow(found.b_from_a, is_clear=is_clear)
         else:
-            self._step_pose = None
+            self._prediction.begin_at(found.b_from_a, share)
             self._doubt_px = 0.0
-            share = agreeing_share(alignment)
-            self._surprise_px = max(self._surprise_px, _FIRST_SURPRISE_PX / max(share, 0.1))
-        self._pose = found.b_from_a
-        self._last_share = agreeing_share(alignment) if means != "view" else 0.0
+        self._last_share = share if means != "view" else 0.0
+        self._last_seen = found.inliers / len(alignment.is_in_view)
         self._frames_lost = self._searches = 0
         self._was_seen = True
         evidence = Evidence(alignment.template_points, alignment.frame_points, found.is_inlier)
         return make_track(
             self.template, found, evidence, means, self._was_seen, alignment.correlation
         )
-
-
-def _rms_distance_px(one: Matrix, other: Matrix, quad: Points) -> float:
-    """How far apart two poses put the quad's corners (4, 2), in frame pixels."""
-    apart = geometry.transform_points(one, quad) - geometry.transform_points(other, quad)
-    return sqrt(float(np.vdot(apart, apart)) / len(quad))
-
-
-def _refused(alignment: Alignment, verdict: Verdict) -> Alignment:
-    """The alignment with its pose taken back, for the reason given."""
-    is_inlier = alignment.registration.is_inlier
-    return replace(alignment, registration=refused(verdict, len(is_inlier), is_inlier))
-
-
-def _shared_motion(model: Model, quad: Points, before: Matrix, after: Matrix) -> Matrix:
-    """What carried the quad from one frame to the next, for the prediction.
-
-    Few freedoms extrapolate well; those of perspective would mostly extrapolate noise.
-    """
-    return fit(
-        model,
-        geometry.transform_points(before, quad),
-        geometry.transform_points(after, quad),
-    )
 
 
 def _register_features(

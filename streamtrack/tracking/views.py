@@ -15,24 +15,26 @@ from dataclasses import dataclass, replace
 
 from streamtrack import geometry
 from streamtrack.frame_view import FrameView
+from streamtrack.pyramid import Pyramid
 from streamtrack.settings import RegistrationSettings
-from streamtrack.tracking.flow import Alignment, FlowAligner, Hope, agreeing_share
+from streamtrack.tracking.alignment import Alignment, Hope, agreeing_share
+from streamtrack.tracking.flow import FlowAligner
 from streamtrack.tracking.template import MIN_FLOW_POINTS, Template, make_passing_patches
-from streamtrack.types import Image, Matrix, Model, Points
+from streamtrack.types import Matrix, Model, Points
 
 MIN_VIEW_SHARE = 0.6
 """Share of a recent view's points that must agree."""
-_HOPE = Hope(0.75, 0.0)
+_HOPED_SHARE = 0.75
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sight:
-    """One clear sight of the target: the grey frame, the pose in it, and where it was seen to be.
+    """One clear sight of the target: the frame in grey, the pose in it, and where it was seen.
 
     ``shown`` (N, 2) are the points of this frame that agreed with the pose.
     """
 
-    grey: Image
+    pyramid: Pyramid
     frame_from_template: Matrix
     shown: Points
 
@@ -47,13 +49,15 @@ class RecentViews:
         self._newest: _Sight | None = None
         self._in_use: _Sight | None = None
         self._aligner: FlowAligner | None = None
+        self.was_made_now = False
+        """Was a template made since this was last set to False?"""
 
     def remember(self, view: FrameView, alignment: Alignment) -> None:
         """Keep a frame in which the target was seen clearly."""
         found = alignment.registration
         if found.b_from_a is not None:
             shown = alignment.frame_points[found.is_inlier]
-            self._newest = _Sight(view.grey, found.b_from_a, shown)
+            self._newest = _Sight(view.pyramid, found.b_from_a, shown)
 
     def forget(self) -> None:
         """The target was lost: what it looked like then says little about where it is now."""
@@ -86,13 +90,14 @@ class RecentViews:
 
     def _use_newest(self) -> None:
         assert self._newest is not None
+        self.was_made_now = True
         sight = self._in_use = self._newest
         quad = geometry.transform_points(sight.frame_from_template, self._template.quad)
-        patches = make_passing_patches(sight.grey, quad, sight.shown)
+        patches = make_passing_patches(sight.pyramid, quad, sight.shown)
         if not patches or len(patches[0].points) < MIN_FLOW_POINTS:
             self._aligner = None
             return
-        seen = replace(self._template, picture=sight.grey, quad=quad, patches=patches)
+        seen = replace(self._template, picture=sight.pyramid.grey, quad=quad, patches=patches)
         self._aligner = FlowAligner(seen, self._settings)
 
     def _align_in_use(self, view: FrameView, guess: Matrix, sigma_px: float) -> Alignment | None:
@@ -102,8 +107,9 @@ class RecentViews:
         template_from_sight = geometry.inverted(sight_from_template)
         is_plane = self._settings is self._flat_settings
         guess, sigma = guess @ template_from_sight, sigma_px if is_plane else None
-        aligned = self._aligner.align_near(view, guess, _HOPE, sigma)
-        if aligned.registration.b_from_a is None:
+        hope = Hope(_HOPED_SHARE, -1.0, 1.0, 0.0, sigma_px)
+        aligned = self._aligner.align_near(view, guess, hope, sigma)
+        if aligned is None:
             aligned = self._aligner.align(view, guess, sigma)
         found = aligned.registration
         if found.b_from_a is not None:

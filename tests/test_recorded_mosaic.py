@@ -47,8 +47,10 @@ def mosaic_view(width=400, shift=0.0, edges=(), names=()):
     return MosaicView(preview, world_from_preview, None, keyframes(shift), edges, names)
 
 
-def preview_from_world():
-    return np.linalg.inv(translation(-10, -20) @ scaling(2.0))
+def square_from_world():
+    """The preview of 400 x 200 fills a square of 768 from side to side."""
+    preview_from_world = np.linalg.inv(translation(-10, -20) @ scaling(2.0))
+    return translation(0, (768 - 384) / 2) @ scaling(1.92) @ preview_from_world
 
 
 class Graph:
@@ -134,7 +136,7 @@ def test_entities_of_the_mosaic_are_there(recorded):
 def test_the_picture_comes_once_a_second_and_at_the_end(recorded):
     frames, pictures = rrd_columns(recorded, "/mosaic/image", BLOB)
     assert frames == [0, 25, 50, 59]
-    assert cv2.imdecode(np.frombuffer(blob(pictures[0]), np.uint8), 1).shape == (200, 400, 3)
+    assert cv2.imdecode(np.frombuffer(blob(pictures[0]), np.uint8), 1).shape == (768, 768, 3)
 
 
 def test_the_frame_lies_where_it_was_placed(recorded):
@@ -142,13 +144,13 @@ def test_the_frame_lies_where_it_was_placed(recorded):
     outlines = dict(zip(frames, outlines, strict=True))
     assert frames == [*range(1, 11), *range(15, 60)]
     assert outlines[10] == []  # lost: nothing is drawn
-    expected = transform_points(preview_from_world() @ pose(30), FRAME)
+    expected = transform_points(square_from_world() @ pose(30), FRAME)
     np.testing.assert_allclose(outlines[30][0][:4], expected, atol=1e-3)
 
 
 def test_keyframes_links_and_loops(recorded):
     quads = rrd_columns(recorded, "/mosaic/keyframes", STRIPS)[1][0]
-    expected = transform_points(preview_from_world(), keyframes()[1])
+    expected = transform_points(square_from_world(), keyframes()[1])
     np.testing.assert_allclose(quads[1][:4], expected, atol=1e-3)
     centres = [np.mean(quad[:4], axis=0) for quad in quads]
     (link,) = rrd_columns(recorded, "/mosaic/links", STRIPS)[1][0]
@@ -164,10 +166,10 @@ def test_paths_follow_the_targets_and_the_adjusted_keyframes(recorded):
     centres = [
         transform_points(pose(index), crossing(tracked("board", index).quad))[0] for index in seen
     ]
-    expected = transform_points(preview_from_world(), centres)
+    expected = transform_points(square_from_world(), centres)
     np.testing.assert_allclose(paths[25][0], expected, atol=0.01)
     moved = np.array(paths[50][0])[: len(expected)]
-    np.testing.assert_allclose(moved, expected + 20.0, atol=0.01)  # 40 px at half size
+    np.testing.assert_allclose(moved, expected + 20.0 * 1.92, atol=0.02)  # 40 px at half size
     frames, places = rrd_columns(recorded, "/mosaic/targets/board/position", "Points2D:positions")
     places = dict(zip(frames, places, strict=True))
     np.testing.assert_allclose(places[20][0], expected[seen.index(20)], atol=0.01)
@@ -233,8 +235,30 @@ def test_a_large_mosaic_is_recorded_small(tmp_path):
             recorder.log_mosaic(mosaic_view(width=3000), 25 * second, float(second))
             assert not recorder.is_mosaic_due(second + 0.5)
     pictures = [blob(one) for one in rrd_columns(path, "/mosaic/image", BLOB)[1]]
-    assert cv2.imdecode(np.frombuffer(pictures[0], np.uint8), 1).shape[1] == 768
+    assert cv2.imdecode(np.frombuffer(pictures[0], np.uint8), 1).shape == (768, 768, 3)
     assert all(len(data) < 600_000 for data in pictures)
+
+
+def test_a_growing_picture_keeps_its_size_and_what_is_drawn_its_place(tmp_path):
+    """The viewer complains of a picture that changes its size."""
+    path = tmp_path / "growing.rrd"
+    with Recorder(path, source(), Settings(), [], has_mosaic=True) as recorder:
+        for second, (width, height) in enumerate([(90, 40), (300, 500), (3000, 400)]):
+            preview = np.zeros((height, width, 3), np.uint8)
+            x0, y0, x1, y1 = width // 4, height // 4, width // 2, height // 2
+            preview[y0:y1, x0:x1] = 255
+            outline = box_quad(x0 - 0.5, y0 - 0.5, x1 - x0, y1 - y0)
+            view = MosaicView(preview, np.eye(3), outline, outline[None], (), ())
+            recorder.log(step_of(25 * second, ()))
+            recorder.log_mosaic(view, 25 * second, float(second))
+    pictures = [blob(one) for one in rrd_columns(path, "/mosaic/image", BLOB)[1]]
+    outlines = rrd_columns(path, "/mosaic/frame", STRIPS)[1]
+    for data, outline in zip(pictures, outlines, strict=True):
+        shown = cv2.imdecode(np.frombuffer(data, np.uint8), 0)
+        assert shown.shape == (768, 768)
+        x, y, width, height = cv2.boundingRect((shown > 127).astype(np.uint8))
+        expected = box_quad(x - 0.5, y - 0.5, width, height)
+        np.testing.assert_allclose(outline[0][:4], expected, atol=1.0)
 
 
 def features(count):

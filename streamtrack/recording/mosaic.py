@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from streamtrack.geometry import box_quad, inverted, scaling, transform_points
+from streamtrack.geometry import box_quad, inverted, scaling, transform_points, translation
 from streamtrack.mosaic.types import MosaicView
 from streamtrack.recording import blueprint, rows
 from streamtrack.recording.blueprint import TargetEntities
@@ -24,7 +24,7 @@ from streamtrack.types import Image, Matrix, Points, Size, Step
 from streamtrack.world import WorldPlace
 
 _IMAGE_EVERY_S = 1.0
-_MAX_SIDE = 768
+_SIDE, _MOST_ENLARGED = 768, 4.0
 _MAX_BYTES = 256_000
 _QUALITIES = (80, 65, 50)
 _MAX_PATH = 1000
@@ -102,9 +102,9 @@ class MosaicLog:
             return
         if self._preview_from_world is None and not self._state:
             self._log_styles()
-        picture, shrink = _bounded(view.preview)
+        picture, square_from_preview = _framed(view.preview)
         data = self._jpeg(picture)
-        preview_from_world = shrink @ inverted(view.world_from_preview)
+        preview_from_world = square_from_preview @ inverted(view.world_from_preview)
         self._preview_from_world = preview_from_world
         self._outlines = np.asarray(view.keyframe_outlines, np.float32).reshape(-1, 4, 2)
         self._stream.log(blueprint.MOSAIC_IMAGE, rr.EncodedImage.from_fields(blob=data))
@@ -249,14 +249,20 @@ def _edge_lines(
     return np.asarray(centres[np.array(pairs)], np.float32)
 
 
-def _bounded(picture: Image) -> tuple[Image, Matrix]:
-    """The picture made small enough, and what maps its pixels to the small one's."""
-    factor = min(1.0, _MAX_SIDE / max(picture.shape[:2]))
-    if factor == 1.0:
-        return picture, np.eye(3)
-    size = max(1, round(picture.shape[1] * factor)), max(1, round(picture.shape[0] * factor))
-    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(small, np.uint8), scaling(factor)
+def _framed(picture: Image) -> tuple[Image, Matrix]:
+    """The picture in the middle of a black square, as large as fits, and what maps its pixels.
+
+    The square is always the same: the viewer takes JPEGs for a video and complains of a change.
+    """
+    factor = min(_MOST_ENLARGED, _SIDE / max(picture.shape[:2]))
+    width, height = (max(1, round(side * factor)) for side in picture.shape[1::-1])
+    method = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
+    square = np.zeros((_SIDE, _SIDE, *picture.shape[2:]), np.uint8)
+    x, y = (_SIDE - width) // 2, (_SIDE - height) // 2
+    square[y : y + height, x : x + width] = cv2.resize(
+        picture, (width, height), interpolation=method
+    )
+    return square, translation(x, y) @ scaling(factor)
 
 
 def _log_styles(stream: rr.RecordingStream) -> None:

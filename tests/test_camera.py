@@ -354,6 +354,23 @@ def test_auto_is_not_carried_along_by_traffic(make_picture: MakePicture) -> None
     assert corner_error(found[-1].world_from_frame, np.eye(3), SIZE) < 0.2
 
 
+def test_a_camera_that_stands_goes_on_standing_behind_what_hides_nearly_all(
+    make_picture: MakePicture,
+) -> None:
+    """Something comes close: seven eighths flow by, and the exposure follows it."""
+    ground, thing = make_picture(31, SIZE), make_picture(32, (1000, 240))
+    frames = []
+    for n in range(80):
+        image = ground.copy()
+        if n >= 40:
+            image[:, 40:] = thing[:, 12 * (n - 40) : 12 * (n - 40) + 280]
+            image = np.asarray(image * 0.8, np.uint8)
+        frames.append(Frame(n, n / 30, image))
+    camera, found = run_auto(frames)
+    assert camera.is_fixed and kinds(found) == ["moving", "fixed"]
+    np.testing.assert_array_equal(found[-1].world_from_frame, np.eye(3))
+
+
 def test_auto_finds_out_that_a_camera_moves(make_clip: MakeClip) -> None:
     clip = make_clip(FLIGHT, 16)
     camera, found = run_auto(clip.source())

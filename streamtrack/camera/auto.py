@@ -26,6 +26,9 @@ from streamtrack.types import CameraKind, CameraPose, Matrix, Points, Size, Trac
 _STILL_PX = 0.75
 """Poses that differ by more are not those of a camera that stands."""
 _DOUBT_PX = 0.5
+_BEGINS, _STAYS = 0.12, 0.07
+"""Shares of the textured cells that must be where they were for a camera to be found at rest, and
+for one at rest to be so still. Where a hand-held camera has moved, they are 0.04 at most."""
 _STILL_FRAMES = 25
 _MOST_STILL_FRAMES = 400
 _OTHER_FRAMES = 5  # in a row: something large may pass by
@@ -96,7 +99,9 @@ class AutoCamera:
     ) -> None:
         """Has the picture been the same for long enough? From here on the camera stands then."""
         levels, hidden, rest = view.levels, _hidden(tracks), self._rest
-        if rest is not None and _is_at_rest(rest.check.of(levels, hidden), rest.check, levels):
+        if rest is not None and _is_at_rest(
+            rest.check.of(levels, hidden), rest.check, levels, _BEGINS
+        ):
             rest.add(pose, view.size_wh)
             if rest.frames >= self._needed:
                 found = rest.pose(view.size_wh)
@@ -117,7 +122,7 @@ class AutoCamera:
             return CameraPose(None, reason=reason, kind=CameraKind.FIXED)
         standing.frames += 1
         seen = standing.check.of(levels, hidden)
-        is_at_rest = _is_at_rest(seen, standing.check, levels)
+        is_at_rest = _is_at_rest(seen, standing.check, levels, _STAYS)
         if is_at_rest and standing.frames < _RENEW_EVERY:
             stood = CameraPose(None, seen.pixels, seen.pixels, keyframe=standing.keyframe)
             return self._unmoved(stood, standing, view)
@@ -172,8 +177,8 @@ class _Rest:
         return geometry.quad_mapping(geometry.image_quad(size_wh), mean)
 
 
-def _is_at_rest(seen: Stand, check: StandCheck, levels: ViewLevels) -> bool:
-    return seen.moved_px < _DOUBT_PX or check.has_stayed(levels)
+def _is_at_rest(seen: Stand, check: StandCheck, levels: ViewLevels, share: float) -> bool:
+    return seen.moved_px < _DOUBT_PX or check.stayed_share(levels) >= share
 
 
 def _hidden(tracks: Sequence[Track]) -> list[Points]:

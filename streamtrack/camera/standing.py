@@ -24,8 +24,6 @@ _OF_PIXELS = 2  # every second of those that a full alignment would take
 _ROUNDS = 2
 _STAYED_PX = 0.4
 _STAYED_CORRELATION = 0.8
-_STAYED_SHARE = 0.12
-"""Of the textured cells: no camera moves while so many stay to the tenth of a pixel."""
 _UNLIKE = 0.75
 """Residuals of this share of the grey values themselves: the views have little in common."""
 
@@ -86,20 +84,21 @@ class StandCheck:
         change = _robust_step(jacobian, residual)
         return Stand(self._corner_shift_px(change), len(seen))
 
-    def has_stayed(self, levels: ViewLevels) -> bool:
-        """Whether so many parts of the picture are just where they were that the camera stands.
+    def stayed_share(self, levels: ViewLevels) -> float:
+        """Share of the textured cells that are where they were, to a fraction of a pixel.
 
         A second look, for views in which so much moves by itself (a road full of cars) that `of`
-        follows that: each cell of the picture is asked by itself how far its pixels have moved.
+        follows that: each cell of the picture is asked by itself how far its pixels have moved,
+        whatever light and shadow do to it.
         """
         pixels = self.reference.pixels(USUAL)
         column, row, _ = pixels.points.astype(np.intp)
         seen = levels.high_passed(USUAL)[row, column]
-        shift_px = _cell_shifts(pixels, seen - pixels.values)
+        shift_px = _cell_shifts(pixels, seen * _cell_gains(pixels, seen) - pixels.values)
         shift_px /= levels.level_from_view(USUAL)[0, 0]
         alike = _cell_correlations(pixels, seen) > _STAYED_CORRELATION
         stayed = np.count_nonzero(alike & (shift_px < _STAYED_PX))
-        return bool(stayed >= _STAYED_SHARE * self.reference.textured_cells)
+        return float(stayed) / max(1, self.reference.textured_cells)
 
     def _shown(self, levels: ViewLevels, hidden: Sequence[Points]) -> npt.NDArray[np.bool_]:
         """Which pixels lie outside the boxes around the quads."""
@@ -139,6 +138,13 @@ def _cell_shifts(pixels: Pixels, residual: npt.NDArray[np.float32]) -> npt.NDArr
         determinant = xx * yy - xy * xy
         x, y = (yy * xr - xy * yr) / determinant, (xx * yr - xy * xr) / determinant
     return np.asarray(np.hypot(x, y), np.float64)
+
+
+def _cell_gains(pixels: Pixels, seen: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """The factor (N,) by which the pixels seen (N,) fit those of their cell best, 0.5 to 2."""
+    both, theirs = (np.bincount(pixels.cell, p) for p in (pixels.values * seen, seen * seen))
+    gains = np.clip(both / np.maximum(theirs, 1e-6), 0.5, 2.0)
+    return gains.astype(np.float32)[pixels.cell]
 
 
 def _cell_correlations(pixels: Pixels, seen: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:

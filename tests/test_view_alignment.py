@@ -114,3 +114,31 @@ def test_what_is_hidden_is_no_evidence(wide: Image) -> None:
 def test_a_senseless_guess_is_refused(guess: Matrix, wide: Image) -> None:
     reference = ReferenceView(ViewLevels(view_of(wide, posed(350, 250), SIZE)))
     assert align(reference, reference.levels, guess).verdict is not Verdict.OK
+
+
+@pytest.mark.parametrize(
+    ("tilt_px", "most_px"),
+    [
+        (0.0, 0.1),  # a similarity: what moves by itself must not tilt it
+        (2.0, 0.7),  # a tilt: a similarity keeps the cells, but not how well they correlate
+        (4.0, 1.2),
+    ],
+)
+def test_a_view_half_of_which_moved_is_a_similarity_only_if_that_explains_it_as_well(
+    tilt_px: float, most_px: float, wide: Image, make_picture: MakePicture
+) -> None:
+    corners = geometry.image_quad(SIZE)
+    tilted = corners + tilt_px * np.array([[1, 0], [-1, 0], [1, 0], [-1, 0]], np.float32)
+    first = posed(350, 250)
+    second = posed(356, 254) @ cv2.getPerspectiveTransform(corners, tilted.astype(np.float32))
+    moved_rows = 202 if tilt_px else 240
+    image = view_of(wide, second, SIZE, 2)
+    image[:moved_rows] = make_picture(77, SIZE)[:moved_rows]
+    reference = ReferenceView(ViewLevels(view_of(wide, first, SIZE, 1)))
+    found = align(reference, ViewLevels(image), posed(6, 4))
+    assert found.inliers < 0.6 * len(found.is_inlier)
+    assert found.reference_from_view is not None
+    still = geometry.box_quad(0, moved_rows, 639, 479 - moved_rows)
+    truth = geometry.inverted(first) @ second
+    off = geometry.transform_points(found.reference_from_view, still)
+    assert np.abs(off - geometry.transform_points(truth, still)).max() < most_px

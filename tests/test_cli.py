@@ -271,6 +271,17 @@ def test_unwritable_output_is_refused_before_tracking(
     assert "cannot write" in capsys.readouterr().err
 
 
+def test_a_ctrl_c_that_nobody_catches_is_one_line(
+    run: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("streamtrack.mosaic.job.run_mosaic", interrupted)
+    assert run("mosaic", "a.png", "b.png", "-o", "m.png") == 1
+    assert capsys.readouterr().err == "streamtrack: error: interrupted\n"
+
+
 def test_version_and_help(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--version") == 0
     assert capsys.readouterr().out.startswith("streamtrack ")

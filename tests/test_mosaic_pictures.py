@@ -477,11 +477,21 @@ def test_what_cannot_be_is_refused_before_any_work(
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["1 0 0 0 1 0", "a b c", "0 0 0 0 0 0 0 0 0"])
-def test_a_truth_that_is_none_is_refused(flight: list[Path], tmp_path: Path, text: str) -> None:
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("1 0 0 0 1 0", "but holds 6"),
+        ("a b c", "no text of numbers"),
+        ("0 0 0 0 0 0 0 0 0", "determinant is 0"),
+        ("1 0 0 0 nan 0 0 0 1", "not finite"),
+    ],
+)
+def test_a_truth_that_is_none_is_refused(
+    flight: list[Path], tmp_path: Path, text: str, says: str
+) -> None:
     truth = tmp_path / "H.txt"
     truth.write_text(text)
-    with pytest.raises(SourceError, match=r"H\.txt"):
+    with pytest.raises(SourceError, match=rf"H\.txt.*{says}"):
         run(tmp_path, flight[:2], truth=truth)
 
 
@@ -512,6 +522,14 @@ def test_interrupted_the_mosaic_so_far_is_written(flight: list[Path], tmp_path: 
     assert 2 <= outcome.summary.frames_used < 9
     assert cv2.imread(str(tmp_path / "m.png")) is not None
     assert len((tmp_path / "p.csv").read_text().splitlines()) - 1 == 9
+
+
+def test_interrupted_early_it_says_that_there_is_no_mosaic(
+    flight: list[Path], tmp_path: Path
+) -> None:
+    outcome = run(tmp_path, flight, stop_after=1)
+    assert "interrupted before two pictures were joined" in str(outcome.error)
+    assert not (tmp_path / "m.png").exists()
 
 
 # -- bounds -------------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ from streamtrack.cli.tools import synth, view
 from streamtrack.cli.track import track
 from streamtrack.errors import StreamtrackError, UsageError
 
+_TYPER_INTERRUPTED = 130  # what Typer returns for a Ctrl-C, without a word
 _LIVE_ADDRESS = re.compile(r"(\S*:)?\d+")
 
 __all__ = ["app", "exit_on_error", "main", "with_live_address"]
@@ -100,6 +101,8 @@ def exit_on_error(run: Callable[[], Any]) -> None:
 
     try:
         result = run()
+        if result == _TYPER_INTERRUPTED:
+            raise KeyboardInterrupt
         if isinstance(result, int):
             sys.exit(result)
     except TyperException as error:

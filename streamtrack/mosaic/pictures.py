@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 _ABSURD_TIMES = 40  # canvas pixels per pixel of all pictures together
 _FEW_FEATURES = 10
+_INTERRUPTED_EARLY = "interrupted before two pictures were joined: there is no mosaic yet"
 
 
 @dataclass(slots=True)
@@ -80,7 +81,9 @@ def run_picture_mosaic(
             result.ended = "interrupted: what was linked until then is written"
             error = StreamtrackError(result.ended)
     except StreamtrackError as raised:
-        error, result.ended = raised, result.ended or str(raised)
+        is_early = should_stop() and result.canvas is None
+        error = StreamtrackError(_INTERRUPTED_EARLY) if is_early else raised
+        result.ended = result.ended or str(error)
     images = _placements(found, result)
     summary = _summary(job, found, result, images, truth)
     summary = _timed(summary, began, cpu_began)

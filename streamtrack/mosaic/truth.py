@@ -20,8 +20,10 @@ def read_truth(path: Path) -> Matrix:
         raise SourceError(f"cannot read the truth {path}: {error.strerror}") from None
     except ValueError:
         raise SourceError(f"the truth {path} is no text of numbers") from None
-    if numbers.shape != (9,) or not np.all(np.isfinite(numbers)):
+    if numbers.shape != (9,):
         raise SourceError(f"the truth {path} must hold 9 numbers, but holds {len(numbers)}")
+    if not np.all(np.isfinite(numbers)):
+        raise SourceError(f"the truth {path} holds numbers that are not finite")
     matrix: Matrix = numbers.reshape(3, 3)
     if abs(np.linalg.det(matrix)) < 1e-12:
         raise SourceError(f"the truth {path} is no mapping: its determinant is 0")

@@ -252,6 +252,7 @@ def test_a_small_thing_beside_a_large_one_is_no_part_of_it() -> None:
     names = names_on(steps, truth, "large")
     assert set(names[15:]) <= {names[15], None} and names[15] is not None
     assert names[15:].count(None) <= 4
+    assert len(all_names(steps)) == 2
 
 
 def _static(index: int, rng: np.random.Generator, ground: Image) -> Image:

@@ -13,6 +13,7 @@ from streamtrack import geometry
 from streamtrack.auto.blobs import Blob
 from streamtrack.auto.boxes import HasBox, box_around, moved_point, touched_edges
 from streamtrack.auto.free_ends import FreeEnds, by_both_ends
+from streamtrack.auto.likeness import Likeness
 from streamtrack.types import Matrix, Points, Size
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
@@ -59,6 +60,7 @@ class Followed(HasBox):
     lost_s: float = 0.0
     still: int = 0
     ends: FreeEnds = field(default_factory=FreeEnds)
+    likeness: Likeness | None = None
     reason: str = ""
 
     @classmethod

@@ -19,8 +19,9 @@ from streamtrack import geometry
 from streamtrack.auto.association import associate
 from streamtrack.auto.background import BackgroundModel, Outstanding
 from streamtrack.auto.blobs import Blob, MotionField, Scene, find_blobs, frame_px
-from streamtrack.auto.boxes import overlap, touched_edges
+from streamtrack.auto.boxes import box_around, overlap, touched_edges
 from streamtrack.auto.followed import Followed, Life
+from streamtrack.auto.likeness import Likeness
 from streamtrack.auto.places import (
     REST_PX,
     fill,
@@ -59,6 +60,8 @@ _MOST_TARGETS = 60
 _BROKEN_FRAMES = 5  # in a row, after which the scene is another one
 _DUPLICATE_OVERLAP = 0.75
 _CARRYING_SHARE = 0.3  # of a thing's place that must stand out for it to be carried
+_WHOLE = 0.85, 1.18  # size of what is found against its own, while it is seen whole
+_CORE_SHARE = 0.75
 _REACH_PX = 4.0  # grid pixels, beyond which nothing is found again
 _ELDER_HITS = 10  # sightings of its own that make it a thing of its own
 _ALIKE_PX = 0.8  # grid pixels a frame, between motions of parts of one thing
@@ -178,6 +181,7 @@ class AutoTargets:
         for thing, blob in pairs:
             thing.take(blob, moment.step_s, moment.size_wh)
             thing.resume(Life.SEEN)
+            _portray(thing, blob, scene)
         met = {id(thing) for thing in [*(thing for thing, _ in pairs), *carried]}
         for thing in self._things:
             if id(thing) not in met:
@@ -345,7 +349,13 @@ def _is_alike(one: Followed, other: Followed, moment: _Moment) -> bool:
 
 
 def _carry(thing: Followed, scene: Scene, moment: _Moment) -> float:
-    """Move a thing as the pixels in its place do; the share of it that stands out."""
+    """Move a thing as its own picture does, or else the pixels in its place; how much shows it."""
+    if thing.likeness is not None:
+        beside = thing.likeness.find(scene.grey, _core(thing, scene))
+        if beside is not None:
+            moved = thing.velocity * moment.step_s + beside * moment.grid_px
+            thing.carry(moved, moment.step_s)
+            return 1.0
     found = motion_within(scene, thing.box)
     if found is None:
         return 0.0
@@ -353,6 +363,20 @@ def _carry(thing: Followed, scene: Scene, moment: _Moment) -> float:
     if share >= _CARRYING_SHARE:
         thing.carry(moved, moment.step_s)
     return share
+
+
+def _portray(thing: Followed, blob: Blob, scene: Scene) -> None:
+    """Keep a picture of a thing that is seen alone and whole."""
+    ratio = blob.size / np.maximum(thing.size, 1e-6)
+    if thing.life is Life.SEEN and (ratio > _WHOLE[0]).all() and (ratio < _WHOLE[1]).all():
+        taken = Likeness.taken(scene.grey, _core(thing, scene))
+        thing.likeness = taken or thing.likeness
+
+
+def _core(thing: Followed, scene: Scene) -> Doubles:
+    """The inner part of a thing's box, in the grid: what lies around it does not belong to it."""
+    core = box_around(thing.center, _CORE_SHARE * thing.size).reshape(2, 2)
+    return geometry.transform_points(scene.grid_from_frame, core).astype(np.float64).ravel()
 
 
 def _is_over(thing: Followed, size_wh: Size) -> bool:

@@ -13,7 +13,6 @@ from typing import Any, Literal, Self, TypeAlias, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from streamtrack.errors import UsageError, unknown_name
-from streamtrack.recording.series import check_keep, parse_keep, parse_rotate
 
 Detector: TypeAlias = Literal["harris", "fast", "agast", "gftt", "brisk", "orb", "sift", "akaze"]
 Descriptor: TypeAlias = Literal["freak", "brisk", "orb", "teblid", "sift", "akaze"]
@@ -119,7 +118,10 @@ class RecordingSettings(_Section):
 
     @model_validator(mode="after")
     def _check_files(self) -> Self:
-        check_keep(parse_rotate(self.rotate), parse_keep(self.keep))
+        if self.rotate is not None or self.keep is not None:
+            from streamtrack.recording.series import check_keep, parse_keep, parse_rotate
+
+            check_keep(parse_rotate(self.rotate), parse_keep(self.keep))
         return self
 
 

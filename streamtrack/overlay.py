@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack.geometry import inverted, transform_points
+from streamtrack.targets import color_number
 from streamtrack.types import Image, Mask, Points, Size, Step, Track, TrackState
 
 Color: TypeAlias = tuple[int, int, int]
@@ -36,9 +37,7 @@ def target_color(index: int) -> Color:
 
 
 def _color_of(index: int, track: Track) -> Color:
-    """The target's colour: by its place in the list, or by its number if it was found."""
-    number = track.name.rpartition("-")[2]
-    return target_color(int(number) if track.is_found and number.isdecimal() else index)
+    return target_color(color_number(track, index))
 
 
 class Trails:

@@ -11,7 +11,7 @@ import numpy as np
 
 from streamtrack import geometry
 from streamtrack.errors import TargetError, UsageError
-from streamtrack.types import Image, Points, Size
+from streamtrack.types import Image, Points, Size, Track
 
 _FORMS = "x,y,w,h or x1,y1,x2,y2,x3,y3,x4,y4 or PICTURE or PICTURE@x,y,w,h or auto"
 _AUTO = "auto"
@@ -180,3 +180,9 @@ def check_quad_in_picture(
             f"target '{name}' ({x0:.0f},{y0:.0f} to {x1:.0f},{y1:.0f}) lies {outside} the "
             f"{size_wh[0]}x{size_wh[1]} picture: give it in pixels of {where}"
         )
+
+
+def color_number(track: Track, place: int) -> int:
+    """Which colour a track has: by its place in the list, or by its number if it was found."""
+    number = track.name.rpartition("-")[2]
+    return int(number) if track.is_found and number.isdecimal() else place

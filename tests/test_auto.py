@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
+from rrd import rrd_columns
 
 from streamtrack import AutoTarget, track
 from streamtrack.auto import AutoTargets
@@ -386,6 +387,31 @@ def test_a_run_writes_all_outputs(tmp_path: Path) -> None:
     assert len(lines) == sum(target["frames_tracked"] for target in summary["targets"])
     assert (tmp_path / "run.rrd").stat().st_size > 0
     assert (tmp_path / "run.avi").stat().st_size > 0
+
+
+def test_a_recording_shows_a_found_target_in_one_colour_and_within_the_frame(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "run.rrd"
+    uri = "synthetic://traffic?seed=2&frames=70&cars=6&size=320x180&fps=25&camera=moving"
+    settings = Settings.model_validate({"camera": "moving"})
+    outputs = Outputs(record=path, shows_mosaic=True)
+    job = TrackJob(uri, [AutoTarget()], settings=settings, outputs=outputs)
+    assert run_track(job, NoProgress(), lambda: False).error is None
+    frames, outlines = rrd_columns(path, "/mosaic/frame", "LineStrips2D:strips")
+    outline = {frame: np.float32(strips[0]) for frame, strips in zip(frames, outlines, strict=True)}
+    colors = set()
+    for name in ("auto-1", "auto-2"):
+        at = f"/mosaic/targets/{name}/position"
+        last = dict(zip(*rrd_columns(path, at, "Points2D:positions"), strict=True))
+        inside = [cv2.pointPolygonTest(outline[f], p[0], True) for f, p in last.items() if p]
+        assert len(inside) > 20 and min(inside) > -1.0
+        quad = f"/camera/targets/{name}/quad"
+        (there,) = rrd_columns(path, at, "Points2D:colors", None)[1][:1]
+        (here,) = rrd_columns(path, quad, "LineStrips2D:colors", None)[1][:1]
+        assert here == there
+        colors.add(tuple(here))
+    assert len(colors) == 2
 
 
 def test_a_summary_says_that_nothing_moved() -> None:

@@ -272,12 +272,14 @@ def build(
     states = [entities.state for _, entities in targets]
     states += [MOSAIC_STATE] if world is World.MOSAIC else []
     states += [SOURCE_STATE] if is_live else []
-    lanes_share = 0.75 + 0.42 * min(len(states), 6)
+    lanes, lanes_share = (
+        ([_lanes(states)], [0.75 + 0.42 * min(len(states), 6)]) if states else ([], [])
+    )
     camera = rrb.Vertical(
         _camera_row(size_wh, targets, timeline),
         _curves(targets, [], is_live),
-        _lanes(states),
-        row_shares=[6.0, 2.6, lanes_share],
+        *lanes,
+        row_shares=[6.0, 2.6, *lanes_share],
         name="Camera",
     )
     if world is World.NONE:
@@ -289,8 +291,8 @@ def build(
     world_tab = rrb.Vertical(
         rrb.Horizontal(_mosaic_view(), around, column_shares=[6.6, 3.4]),
         *([_curves([], curves, is_live)] if curves else []),
-        _lanes(states),
-        row_shares=[7.0, *([1.8] if curves else []), lanes_share],
+        *lanes,
+        row_shares=[7.0, *([1.8] if curves else []), *lanes_share],
         name="World",
     )
     tabs = rrb.Tabs(camera, world_tab, active_tab=0 if targets else 1)
@@ -314,7 +316,7 @@ def _lanes(states: Sequence[str]) -> rrb.StateTimelineView:
     return rrb.StateTimelineView(
         name="State",
         origin="/",
-        contents=[f"/{path.lstrip('/')}" for path in states] or "/targets/**",
+        contents=[f"/{path.lstrip('/')}" for path in states],
     )
 
 

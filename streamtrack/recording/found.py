@@ -13,6 +13,7 @@ import numpy as np
 import rerun as rr
 
 from streamtrack.recording import blueprint, rows
+from streamtrack.targets import color_number
 from streamtrack.types import Step, Track, TrackState
 
 
@@ -63,7 +64,7 @@ class FoundLog:
             if not self._count:
                 self._log_curve_styles()
             self._count += 1
-            shown = self._alive[track.name] = _Shown(track.state, self._count)
+            shown = self._alive[track.name] = _Shown(track.state, color_number(track, self._count))
             self._log_style(track.name, shown.number)
             message = f"frame {frame}: {track.name} appeared"
         elif shown.state is not track.state:

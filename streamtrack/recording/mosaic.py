@@ -20,6 +20,7 @@ from streamtrack.mosaic.types import MosaicView
 from streamtrack.recording import blueprint, rows
 from streamtrack.recording.blueprint import TargetEntities
 from streamtrack.recording.video import jpeg_of
+from streamtrack.targets import color_number
 from streamtrack.types import Image, Matrix, Points, Size, Step
 from streamtrack.world import WorldPlace
 
@@ -50,7 +51,7 @@ class MosaicLog:
         self._state = ""
         self._shown_state = ""
         self._targets: dict[str, _Target] = {}
-        self._numbers = 0
+        self._numbers: dict[str, int] = {}
         self._places: dict[str, WorldPlace] = {}
         self._frame_index = -1
         self._curves: dict[str, str] = {}
@@ -66,6 +67,7 @@ class MosaicLog:
         """Note where the targets are in a frame whose place on the mosaic may come to be known."""
         self._frame_index = step.frame.index
         self._places = {track.name: track.world for track in step.tracks if track.world is not None}
+        self._numbers = {t.name: color_number(t, place) for place, t in enumerate(step.tracks)}
 
     def log_world(self, step: Step) -> None:
         """Record the camera's view and the targets' paths where no mosaic is made, in world px."""
@@ -114,6 +116,9 @@ class MosaicLog:
             self._log_strips(path, _edge_lines(outlines, view, is_loop))
         if view.frame_outline is not None:
             self._log_outline(view.frame_outline)
+        for target in self._targets.values():
+            if target.is_shown:  # in the same frame it may lie where the view before had it
+                self._log_position(target)
         self.log_paths()
 
     def log_paths(self) -> None:
@@ -169,21 +174,23 @@ class MosaicLog:
         for name, place in self._places.items():
             target = self._target(name, place)
             target.place, target.is_shown = place, True
-            if self._preview_from_world is not None:
-                position = transform_points(self._preview_from_world, place.position)
-                self._stream.log(target.entities.mosaic_position, rows.points(position))
+            self._log_position(target)
         for name, target in self._targets.items():
             if target.is_shown and name not in self._places:
                 target.is_shown = False
                 nowhere = rows.points(np.zeros((0, 2), np.float32))
                 self._stream.log(target.entities.mosaic_position, nowhere)
 
+    def _log_position(self, target: _Target) -> None:
+        if self._preview_from_world is not None:
+            position = transform_points(self._preview_from_world, target.place.position)
+            self._stream.log(target.entities.mosaic_position, rows.points(position))
+
     def _target(self, name: str, place: WorldPlace) -> _Target:
         """The target's part of the recording, begun when it is first seen in the world."""
         found = self._targets.pop(name, None)
         if found is None:
-            found = _Target(TargetEntities.of(name), self._numbers, place)
-            self._numbers += 1
+            found = _Target(TargetEntities.of(name), self._numbers[name], place)
             _log_target_styles(self._stream, found.entities, name, found.number)
         self._targets[name] = found  # the last in the order of when they were seen
         if len(self._targets) > _MOST_TARGETS:

@@ -219,7 +219,7 @@ def _fit(
     to_reference, to_view = reference.levels.level_from_view(level), view.level_from_view(level)
     mapping = to_view @ start @ geometry.inverted(to_reference)
     outlines = [geometry.transform_points(to_view, quad) for quad in hidden]
-    pixels = _in_view(reference.pixels(level), mapping, values.shape, outlines)
+    pixels = _in_view(reference.pixels(level), mapping, values.shape, EDGE_PX[level], outlines)
     if len(pixels.values) < _LEAST_PIXELS[level]:
         return None
     basis = _FREEDOMS[level] if basis is None else basis
@@ -292,12 +292,15 @@ _PRIOR = _make_prior()
 
 
 def _in_view(
-    pixels: Pixels, mapping: Matrix, shape: tuple[int, ...], outlines: Sequence[Points]
+    pixels: Pixels,
+    mapping: Matrix,
+    shape: tuple[int, ...],
+    edge: int,
+    outlines: Sequence[Points],
 ) -> Pixels:
-    """Those of the pixels that the view shows, outside the outlines (4, 2)."""
+    """Those of the pixels that the view shows, off its edge and outside the outlines (4, 2)."""
     x, y, depth = _projected(mapping, pixels.points)
     height, width = shape
-    edge = EDGE_PX
     inside = (x >= edge) & (y >= edge) & (x < width - 1 - edge) & (y < height - 1 - edge)
     inside &= depth > 0
     for outline in outlines:

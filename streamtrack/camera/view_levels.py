@@ -23,7 +23,8 @@ _MAX_LEVELS = 5
 _CELLS = (12, 9)
 _CELL_PIXELS = (180, 44, 20, 12, 8)  # chosen of each cell, by level
 _HIGH_PASS_PX = 25
-EDGE_PX = 3
+EDGE_PX = (13, 3, 3, 3, 3)
+"""Left out at the edges, by level: local means reach over them, which links between keyframes feel."""
 _MIN_GRADIENT = 0.8  # grey levels a pixel, RMS of a cell's chosen pixels
 
 
@@ -125,8 +126,9 @@ def _choose_pixels(levels: ViewLevels, level: int, hidden: Sequence[Points]) -> 
     gx = np.asarray(cv2.Sobel(values, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8), np.float32)
     gy = np.asarray(cv2.Sobel(values, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8), np.float32)
     strength = np.asarray(gx * gx + gy * gy, np.float32)
-    strength[:EDGE_PX] = strength[-EDGE_PX:] = 0
-    strength[:, :EDGE_PX] = strength[:, -EDGE_PX:] = 0
+    edge = EDGE_PX[level]
+    strength[:edge] = strength[-edge:] = 0
+    strength[:, :edge] = strength[:, -edge:] = 0
     for quad in hidden:
         seen = geometry.transform_points(levels.level_from_view(level), quad)
         if np.isfinite(seen).all():

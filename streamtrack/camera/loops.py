@@ -74,7 +74,7 @@ class LoopCloser:
                 if self._job is not None:
                     self._take_over(self._job)
                 self._begin()
-            if len(self._graph.keyframes) > 2:
+            if len(self._graph.links) >= len(self._graph.keyframes) > 2:  # no mere chain
                 draft = Draft(self._graph)
                 keyframe_links.adjust_all(draft)
                 draft.publish(self._graph)

@@ -23,8 +23,8 @@ _MAX_LEVELS = 5
 _CELLS = (12, 9)
 _CELL_PIXELS = (180, 44, 20, 12, 8)  # chosen of each cell, by level
 _HIGH_PASS_PX = 25
-EDGE_PX = (13, 3, 3, 3, 3)
-"""Left out at the edges, by level: local means reach over them, which links between keyframes feel."""
+EDGE_PX = (9, 3, 3, 3, 3)
+"""Left out at the edges, by level: local means reach over them, and keyframes' links feel that."""
 _MIN_GRADIENT = 0.8  # grey levels a pixel, RMS of a cell's chosen pixels
 
 

@@ -272,13 +272,11 @@ def build(
     states = [entities.state for _, entities in targets]
     states += [MOSAIC_STATE] if world is World.MOSAIC else []
     states += [SOURCE_STATE] if is_live else []
-    lanes, lanes_share = (
-        ([_lanes(states)], [0.75 + 0.42 * min(len(states), 6)]) if states else ([], [])
-    )
+    lanes_share = [0.75 + 0.42 * min(len(states), 6)] if states else []
     camera = rrb.Vertical(
         _camera_row(size_wh, targets, timeline),
         _curves(targets, [], is_live),
-        *lanes,
+        *_lanes(states),
         row_shares=[6.0, 2.6, *lanes_share],
         name="Camera",
     )
@@ -291,7 +289,7 @@ def build(
     world_tab = rrb.Vertical(
         rrb.Horizontal(_mosaic_view(), around, column_shares=[6.6, 3.4]),
         *([_curves([], curves, is_live)] if curves else []),
-        *lanes,
+        *_lanes(states),
         row_shares=[7.0, *([1.8] if curves else []), *lanes_share],
         name="World",
     )
@@ -312,12 +310,11 @@ def _camera_row(
     return rrb.Horizontal(_camera_view(size_wh), side, column_shares=[5.0, 3.0])
 
 
-def _lanes(states: Sequence[str]) -> rrb.StateTimelineView:
-    return rrb.StateTimelineView(
-        name="State",
-        origin="/",
-        contents=[f"/{path.lstrip('/')}" for path in states],
-    )
+def _lanes(states: Sequence[str]) -> list[rrb.StateTimelineView]:
+    """A view of the states, one of its own for each tab, if there are any."""
+    contents = [f"/{path.lstrip('/')}" for path in states]
+    view = rrb.StateTimelineView(name="State", origin="/", contents=contents)
+    return [view] if states else []
 
 
 def _tracks_view() -> rrb.TextDocumentView:

@@ -64,3 +64,15 @@ def test_a_target_found_anew_may_be_anywhere_next() -> None:
     prediction.begin_at(_REST, share=0.5)
     assert np.array_equal(prediction.guess, _REST)
     assert prediction.surprise_px >= 10.0
+
+
+def test_poses_with_hidden_corners_do_not_run_away() -> None:
+    """Where corners are guessed, a guess must not feed the change of motion that made it."""
+    prediction = _followed([geometry.translation(0.4 * t * t, 0) for t in range(_FRAMES)])
+    steps = []
+    for _ in range(10):
+        guess = prediction.guess
+        assert prediction.pose is not None
+        steps.append(rms_distance_px(guess, prediction.pose, _QUAD))
+        prediction.follow(guess, is_clear=False)
+    assert max(steps[1:]) <= steps[0] + 0.01

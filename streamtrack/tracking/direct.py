@@ -27,13 +27,14 @@ from streamtrack.tracking.alignment import (
 )
 from streamtrack.tracking.blur import motion_blur
 from streamtrack.tracking.likeness import local_correlation, matched_in_grey, shift_left
-from streamtrack.tracking.refine import CONVERGED_PX, Refinement, refined
+from streamtrack.tracking.refine import Refinement, refined
 from streamtrack.tracking.template import Patch, Template
 from streamtrack.types import Matrix, Model, Registration, Verdict
 
 SMEARING_PX = 8.0
 """Motion in a frame: less is hardly smeared."""
 _ROUGHLY_CONVERGED_PX = 0.2
+_CONVERGED_PX = 0.15  # patch pixels: what a further step would still move is a tenth of it
 _NEAR_PX = 0.7  # patch pixels that a guess may be off to be refined at full resolution at once
 
 
@@ -64,7 +65,7 @@ def align_directly(
             smear = motion_blur(coarse.image, rough.seen, area)
             if smear.any():
                 fine = fine.smeared(smear * (fine.scale / coarse.scale))
-    found = _aligned(view, fine, pose, richest, CONVERGED_PX)
+    found = _aligned(view, fine, pose, richest, _CONVERGED_PX)
     if found is None or judge_mapping(found.pose, template.quad) is not Verdict.OK:
         return _nowhere(view, fine, pose)
     return _checked(view, template, fine, settings, found)

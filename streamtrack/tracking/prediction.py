@@ -63,14 +63,16 @@ class Prediction:
 
     def follow(self, pose: Matrix, *, is_clear: bool) -> None:
         """The target was followed to a pose; a clear sight of it tells how good guesses are."""
-        if is_clear:
-            for order, guess in enumerate(self._all_guesses()):
-                off_px = rms_distance_px(guess, pose, self._quad)
-                self._off_px[order] += _RATE * (off_px - self._off_px[order])
         assert self.pose is not None
         before, after = (geometry.transform_points(p, self._quad) for p in (self.pose, pose))
+        if is_clear:
+            for order, guess in enumerate(self._all_guesses()):
+                off_px = _rms_px(geometry.transform_points(guess, self._quad) - after)
+                self._off_px[order] += _RATE * (off_px - self._off_px[order])
         # Few freedoms extrapolate well; those of perspective would mostly extrapolate noise.
-        self._steps = [*self._steps[-1:], fit(self._model, before, after)]
+        # Poses with hidden corners would make a change of motion run away.
+        kept = self._steps[-1:] if is_clear else []
+        self._steps = [*kept, fit(self._model, before, after)]
         self.pose, self._guesses = pose, []
 
     def begin_at(self, pose: Matrix, share: float) -> None:
@@ -85,5 +87,8 @@ class Prediction:
 
 def rms_distance_px(one: Matrix, other: Matrix, quad: Points) -> float:
     """How far apart two poses put the quad's corners (4, 2), in frame pixels."""
-    apart = geometry.transform_points(one, quad) - geometry.transform_points(other, quad)
-    return sqrt(float(np.vdot(apart, apart)) / len(quad))
+    return _rms_px(geometry.transform_points(one, quad) - geometry.transform_points(other, quad))
+
+
+def _rms_px(offsets: Points) -> float:
+    return sqrt(float(np.vdot(offsets, offsets)) / len(offsets))

@@ -35,8 +35,7 @@ _MIN_PIXELS = 150
 _MIN_GRADIENT = 1.0
 _HIGH_PASS_PX = 17
 _ROUNDS = 4
-CONVERGED_PX = 0.04
-"""Patch pixels."""
+_CONVERGED_PX = 0.04  # patch pixels
 _MAX_MOVE_SHARE = 0.1
 _SAMPLE_STEP = 4
 
@@ -128,7 +127,7 @@ def refined(
     support: Mask,
     model: Model,
     prior: Prior | None,
-    converged_px: float = CONVERGED_PX,
+    converged_px: float = _CONVERGED_PX,
 ) -> Refinement | None:
     """``pose`` (frame_from_template) moved to where the grey values fit best, or None.
 

@@ -59,6 +59,7 @@ _REMEMBERED_SHARE = 0.4  # of the points in view, for a frame to be a recent vie
 _VIEW_ADVANTAGE = 0.3  # in share of points, of a recent view over the first
 _RENEWED_BELOW_SHARE = 0.75
 _FRAMES_BETWEEN_VIEWS = 4  # after a view that did not help
+_FRAMES_BETWEEN_NEAR = 3  # after a guess that was not as good as hoped: blur stays for a while
 _COLOR_REACH_SHARE = 0.04  # of the target's size: how far around a point colours are compared
 
 
@@ -109,6 +110,7 @@ class HybridTracker:
         self._is_in_view = False
         self._flatness = Flatness(template.quad)
         self._frames_to_next_view = 0
+        self._frames_to_next_near = 0
         self._uses_views = settings.registration.model == "auto"
         only_shifts = settings.registration.model == "translation"
         step_model = Model.TRANSLATION if only_shifts else Model.SIMILARITY
@@ -214,10 +216,13 @@ class HybridTracker:
                 view, guess, Hope(_CLEAR_VIEW_SHARE, -1.0, 0.0, 0.0, off_px)
             )
         hope = self._hope()
-        if hope is not None:
+        if self._frames_to_next_near:
+            self._frames_to_next_near -= 1
+        elif hope is not None:
             near = self._aligner.align_near(view, guess, hope, self._sigma_px)
             if near.registration.b_from_a is not None:
                 return near
+            self._frames_to_next_near = _FRAMES_BETWEEN_NEAR
         return self._aligner.align(view, guess, self._sigma_px)
 
     def _follow_views(self, view: FrameView, followed: Alignment | None) -> Alignment | None:

@@ -109,7 +109,7 @@ class RecentViews:
         guess, sigma = guess @ template_from_sight, sigma_px if is_plane else None
         hope = Hope(_HOPED_SHARE, -1.0, 1.0, 0.0, sigma_px)
         aligned = self._aligner.align_near(view, guess, hope, sigma)
-        if aligned is None:
+        if aligned.registration.b_from_a is None:
             aligned = self._aligner.align(view, guess, sigma)
         found = aligned.registration
         if found.b_from_a is not None:

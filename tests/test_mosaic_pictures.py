@@ -16,6 +16,7 @@ from test_mosaic_rotation import turned
 
 from streamtrack import geometry
 from streamtrack.errors import OutputError, SourceError, StreamtrackError, UsageError
+from streamtrack.evaluation import corner_error
 from streamtrack.mosaic.job import (
     MosaicJob,
     MosaicOutcome,
@@ -124,6 +125,28 @@ def corner_errors(outcome: MosaicOutcome, truth: list[Matrix], reference: int) -
 
 
 # -- flat scenes --------------------------------------------------------------------------------
+
+
+def test_copies_of_a_picture_change_nothing(ground: Image, tmp_path: Path) -> None:
+    corners = geometry.image_quad(SIZE)
+    tilted = corners + np.array([[0, 0], [-30, 20], [-10, -15], [0, 0]], np.float32)
+    place = geometry.translation(260, 200) @ cv2.getPerspectiveTransform(corners, tilted)
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]].astype(np.float32)
+    bent = x + 1.5 * np.sin(y / 30), y + 1.5 * np.sin(x / 40)  # no homography follows it
+    pictures = seen(ground, geometry.translation(200, 200)), seen(ground, place)
+    pictures = pictures[0], cv2.remap(pictures[1], *bent, cv2.INTER_CUBIC)
+    paths = [tmp_path / f"{name}.png" for name in ("a1", "a2", "a3", "a4", "b")]
+    for path in paths:
+        cv2.imwrite(str(path), pictures[path.stem == "b"].astype(np.uint8))
+    alone, together = run(tmp_path, [paths[0], paths[-1]]), run(tmp_path, paths)
+    assert together.summary.frames_used == 5
+    assert together.summary.transformation_model == alone.summary.transformation_model
+    apart = []
+    for outcome in (alone, together):
+        first, last = (outcome.summary.images[i].world_from_picture for i in (0, -1))
+        assert first is not None and last is not None
+        apart.append(geometry.inverted(first) @ last)
+    assert corner_error(apart[1], apart[0], SIZE) < 1.0
 
 
 def test_a_flight_is_laid_out_to_half_a_pixel(

@@ -251,7 +251,9 @@ def _climb(
     ladder = ladder or [top]
     found = [solve(problem, _reduced(problem, anchored, ladder[0]), ladder[0])]
     for step in ladder[1:]:
-        found.append(solve(problem, found[-1].poses, step, is_graduated=False))
+        # A model too poor for a picture's links rejects them all: the next one hears them again.
+        is_graduated = _linked(problem, found[-1]) < len(start)
+        found.append(solve(problem, found[-1].poses, step, is_graduated))
     own_noise_px = estimated_noise_px(
         problem, transfer_errors_of(problem, problem.own), found[-1].is_used
     )
@@ -261,8 +263,17 @@ def _climb(
         noise_px = min(found[-1].noise_px, given.noise_px)
         if given.cost(noise_px) < found[-1].cost(noise_px):
             found[-1] = given
-    best = found[-1] if model != "auto" else _that_pays(found)
+    if model != "auto":
+        return _rooted(problem, anchor, found[-1])
+    whole = [one for one in found if _linked(problem, one) >= _linked(problem, found[-1])]
+    best = _that_pays(whole)
     return _rooted(problem, anchor, best)
+
+
+def _linked(problem: Problem, solution: Solution) -> int:
+    """How many pictures have a link that the solution does not reject."""
+    used = np.concatenate([solution.is_used, solution.is_used])
+    return len(set(problem.a[used].tolist()) | set(problem.b[used].tolist()))
 
 
 def _rooted(problem: Problem, anchor: Matrix, solution: Solution) -> Solution:

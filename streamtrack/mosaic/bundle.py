@@ -12,6 +12,7 @@ are weighted by Huber's function.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -27,6 +28,7 @@ _CONVERGED_PX = 5e-3
 MIN_NOISE_PX = 0.05
 _MIN_TOLERANCE_PX = 1.0  # links are never wrong for less than three times this
 _HUBER = 1.345  # times the noise: 95 % efficient for Gaussian errors
+_MIN_EXPOSURES = 0.25  # of the links
 _DENSE_UNKNOWNS = 240
 _PRIOR_FLOOR = 1e-5
 _DAMPING = 1e-9
@@ -50,7 +52,7 @@ _DEVIATION_ROWS[2, 6] = _DEVIATION_ROWS[3, 7] = 1.0
 _SIMILARITY_ROWS = np.linalg.pinv(_FREEDOMS[Model.SIMILARITY])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Problem:
     """Links as padded arrays; every link is there twice, with half of its pairs each way.
 
@@ -78,6 +80,18 @@ class Problem:
     @property
     def links(self) -> int:
         return len(self.a) // 2
+
+    @cached_property
+    def tells_noise(self) -> Mask:
+        """Which links (L,) are of two exposures: those of a picture and its copy have no noise.
+
+        All of them where hardly any are, as with rendered pictures.
+        """
+        errors = transfer_errors_of(self, self.own)
+        squares = _of_links((self.counts * np.minimum(errors, 1e6) ** 2).sum(axis=1))
+        pairs = np.maximum(_of_links(self.counts.sum(axis=1)), 1)
+        tells: Mask = np.sqrt(squares / pairs) > MIN_NOISE_PX
+        return tells if np.mean(tells) > _MIN_EXPOSURES else np.ones_like(tells)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,7 +172,7 @@ class _Rejection:
     """Weights of whole links by graduated non-convexity: first all count, then those that agree."""
 
     def __init__(self, problem: Problem, errors: Doubles, is_graduated: bool) -> None:
-        self._counts = problem.counts
+        self._counts, self._tells_noise = problem.counts, problem.tells_noise
         self._pairs = np.maximum(_of_links(problem.counts.sum(axis=1)), 1)
         worst, tolerance = float(np.max(self._rms(errors))), self._tolerance(errors)
         self._mu = max(1.0, 2 * (worst / tolerance) ** 2) if is_graduated else 1.0
@@ -170,7 +184,8 @@ class _Rejection:
 
     def _tolerance(self, errors: Doubles) -> float:
         """RMS of a link that counts half: three times what links usually have."""
-        return 3 * max(_MIN_TOLERANCE_PX, float(np.median(self._rms(errors))))
+        usual = float(np.median(self._rms(errors)[self._tells_noise]))
+        return 3 * max(_MIN_TOLERANCE_PX, usual)
 
     def weights(self, errors: Doubles) -> Doubles:
         """What each link (L,) counts, 0..1."""
@@ -191,9 +206,8 @@ class _Rejection:
 
 def estimated_noise_px(problem: Problem, errors: Doubles, is_used: Mask | None = None) -> float:
     """Standard deviation a coordinate of one pair's error, from the median length."""
-    is_pair = problem.counts > 0
-    if is_used is not None:
-        is_pair = is_pair & np.concatenate([is_used, is_used])[:, None]
+    told = problem.tells_noise if is_used is None else problem.tells_noise & is_used
+    is_pair = (problem.counts > 0) & np.concatenate([told, told])[:, None]
     if not is_pair.any():
         return MIN_NOISE_PX
     alone = errors[is_pair] * np.sqrt(problem.counts[is_pair])

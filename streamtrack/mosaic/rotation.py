@@ -31,6 +31,7 @@ _FEW_POINTS = 30  # of each link, to tell focal lengths apart
 _FREE_FOCAL = 0.01  # relative deviation of one picture's focal length from the common one
 _FOCAL_RANGE = (0.25, 20.0)  # of the longer side: 127 to 3 degrees of view
 _MIN_NOISE_PX = 0.1
+_COPY_PX = 0.05
 _HOPELESS = 0.12  # of the longer side: homographies that miss rotations by so much are none
 
 
@@ -163,12 +164,16 @@ def _median_misfit(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pairs:
-    """Inlier pairs of one link about the pictures' centres, rows of the pictures it joins."""
+    """Inlier pairs of one link about the pictures' centres, rows of the pictures it joins.
+
+    ``tells_noise`` is False between a picture and its copy, which say nothing about a camera.
+    """
 
     a: int
     b: int
     xy_a: Doubles
     xy_b: Doubles
+    tells_noise: bool = True
 
 
 def adjust_rotations(
@@ -194,7 +199,7 @@ def adjust_rotations(
         return None
     focals = scales * np.exp(state.log_focal + state.deviations)
     errors = [_lengths(_residuals(state, scales, p)[0]) for p in pairs]
-    joined = np.concatenate(errors)
+    joined = np.concatenate([errors[i] for i, p in enumerate(pairs) if p in _telling(pairs)])
     near = joined[joined < 3 * noise_px]
     medians = dict(zip(map(id, used), (float(np.median(e)) for e in errors), strict=True))
     to_anchor = state.rotations[row[anchor]].T
@@ -218,6 +223,7 @@ def _pairs_of(link: Link, row: Mapping[int, int], sizes: Mapping[int, Size]) -> 
         row[link.b],
         link.a_points[kept].astype(np.float64) - centre_a,
         link.b_points[kept].astype(np.float64) - centre_b,
+        not link.rmse_px < _COPY_PX,
     )
 
 
@@ -346,9 +352,15 @@ def _minimise(
     return state, _noise(state, scales, pairs)
 
 
+def _telling(pairs: Sequence[_Pairs]) -> Sequence[_Pairs]:
+    """The pairs of two exposures; all of them where there are none but copies."""
+    return [p for p in pairs if p.tells_noise] or pairs
+
+
 def _noise(state: _State, scales: Doubles, pairs: Sequence[_Pairs]) -> float:
     """Standard deviation of one coordinate, from the median length of all residuals."""
-    lengths = np.concatenate([_lengths(_residuals(state, scales, p)[0]) for p in pairs])
+    told = _telling(pairs)
+    lengths = np.concatenate([_lengths(_residuals(state, scales, p)[0]) for p in told])
     return max(_MIN_NOISE_PX, float(np.median(lengths)) / 1.1774)
 
 

@@ -481,6 +481,26 @@ def test_a_stream_that_shows_nothing_is_no_success(
     assert all(row["reason"] for row in poses_of(tmp_path))
 
 
+def test_another_size_midway_is_another_camera_until_the_first_is_back(
+    tmp_path: Path, make_clip: MakeClip, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pictures of another size have no place in this world, and leave no trace in it."""
+    clip = make_clip("flight?size=320x240&frames=40&step=9", 10)
+    other = make_clip("flight?size=160x120&frames=40&seed=2", 10)
+    mixed = {n: other.frames[n].image for n in (4, 5, 6)}
+    given_source(monkeypatch, clip.with_images(mixed))
+    outcome = run(job(tmp_path))
+    assert outcome.error is None
+    rows, truths = poses_of(tmp_path), clip.truths
+    said = ["the picture's size changed" if n in mixed else "" for n in range(10)]
+    assert [row["reason"] for row in rows] == said
+    assert outcome.summary.frames_skipped == {"the picture's size changed": 3}
+    for row, truth in zip(rows, truths, strict=True):
+        if row["status"] == "used":
+            shift = float(row["h13"]) - truth.world_from_frame[0, 2]
+            assert abs(shift) < 1.0
+
+
 def test_a_cut_is_left_out_and_told(
     tmp_path: Path, make_clip: MakeClip, make_picture: MakePicture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

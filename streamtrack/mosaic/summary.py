@@ -188,7 +188,7 @@ class MosaicSummary:
             ("Threshold", f"{features.threshold_or_default:g}"),
             ("Descriptor", features.descriptor),
             *self._evidence_rows(),
-            ("Transformation model", self.transformation_model or "none: nothing could be placed"),
+            ("Transformation model", self.transformation_model or self._no_model_text()),
             ("Projection", self._projection_text()),
             ("Warping", f"backward, {mosaic.warping}"),
             ("Blending", mosaic.blending),
@@ -211,6 +211,10 @@ class MosaicSummary:
         if self.ended:
             rows.append(("Ended", self.ended))
         return rows
+
+    def _no_model_text(self) -> str:
+        is_one_view = bool(self.frames_used)
+        return "none: one keyframe sees it all" if is_one_view else "none: nothing could be placed"
 
     def _projection_text(self) -> str:
         if self.projection is None:

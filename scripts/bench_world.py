@@ -35,7 +35,7 @@ import numpy.typing as npt
 from streamtrack import geometry
 from streamtrack.camera.auto import make_camera
 from streamtrack.evaluation import corner_error
-from streamtrack.mosaic.stream import StreamMosaic
+from streamtrack.mosaic.stream.growing import StreamMosaic
 from streamtrack.pipeline import track
 from streamtrack.settings import build_settings
 from streamtrack.targets import Target

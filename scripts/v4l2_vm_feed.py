@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 from v4l2_emulator import DEFAULT_FRAMES, default_picture, encode_number, encoded
 
-from streamtrack.sources import _v4l2_api as api
+from streamtrack.sources.v4l2 import api
 
 BUF_TYPE_OUTPUT = 2
 COLORSPACE_SRGB = 8

@@ -28,11 +28,11 @@ from v4l2_emulator import DEFAULT_FRAMES, decode_number  # noqa: E402
 
 from streamtrack.devices import find_devices  # noqa: E402
 from streamtrack.errors import StreamtrackError  # noqa: E402
-from streamtrack.sources import _v4l2_api as api  # noqa: E402
-from streamtrack.sources._v4l2_controls import plain_name  # noqa: E402
-from streamtrack.sources._v4l2_formats import opened  # noqa: E402
 from streamtrack.sources.capture import Captured, CaptureEndedError  # noqa: E402
-from streamtrack.sources.v4l2 import V4L2Capture  # noqa: E402
+from streamtrack.sources.v4l2 import api  # noqa: E402
+from streamtrack.sources.v4l2.camera import V4L2Capture  # noqa: E402
+from streamtrack.sources.v4l2.controls import plain_name  # noqa: E402
+from streamtrack.sources.v4l2.formats import opened  # noqa: E402
 
 VIVID = "/dev/video0"
 MPLANE = "/dev/video10"
@@ -276,9 +276,10 @@ def busy() -> str:
         read(capture, 1)
         own = error_of(VIVID)
     assert "this program itself" in own
-    code = f"import sys; sys.path.insert(0, {str(ROOT)!r})\nfrom streamtrack.sources.v4l2 import "
-    code += (
-        f"V4L2Capture\nwith V4L2Capture('{VIVID}'): print('ready', flush=True); sys.stdin.read()"
+    code = (
+        f"import sys; sys.path.insert(0, {str(ROOT)!r})\n"
+        "from streamtrack.sources.v4l2.camera import V4L2Capture\n"
+        f"with V4L2Capture('{VIVID}'): print('ready', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen(
         [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE

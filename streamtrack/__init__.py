@@ -23,7 +23,7 @@ if TYPE_CHECKING:
         TargetError,
         UsageError,
     )
-    from streamtrack.mosaic.stream import StreamMosaic
+    from streamtrack.mosaic.stream.growing import StreamMosaic
     from streamtrack.pipeline import track
     from streamtrack.settings import Settings, build_settings
     from streamtrack.sources import open_source
@@ -85,7 +85,7 @@ _HOMES = {
         "TargetError",
         "UsageError",
     ),
-    "streamtrack.mosaic.stream": ("StreamMosaic",),
+    "streamtrack.mosaic.stream.growing": ("StreamMosaic",),
     "streamtrack.pipeline": ("track",),
     "streamtrack.settings": ("Settings", "build_settings"),
     "streamtrack.sources": ("open_source",),

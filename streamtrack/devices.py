@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from streamtrack.sources._v4l2_choice import Wanted, choose, rate_to_ask
-from streamtrack.sources._v4l2_controls import ControlInfo, list_controls
-from streamtrack.sources._v4l2_formats import (
+from streamtrack.sources.v4l2.choice import Wanted, choose, rate_to_ask
+from streamtrack.sources.v4l2.controls import ControlInfo, list_controls
+from streamtrack.sources.v4l2.formats import (
     FORMATS,
     Mode,
     NodeKind,
@@ -21,8 +21,8 @@ from streamtrack.sources._v4l2_formats import (
     read_modes,
     stable_paths,
 )
-from streamtrack.sources._v4l2_trouble import trouble
-from streamtrack.sources._v4l2_uri import uri_of
+from streamtrack.sources.v4l2.trouble import trouble
+from streamtrack.sources.v4l2.uri import uri_of
 from streamtrack.types import Size
 
 __all__ = ["Device", "Mode", "find_devices", "sizes_and_rates", "to_json"]

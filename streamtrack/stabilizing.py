@@ -18,12 +18,12 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.mosaic.painting import refusal
+from streamtrack.mosaic.stream.painting import refusal
 from streamtrack.settings import StabilizeSettings
 from streamtrack.types import Image, Matrix, Points, Size, Step
 
 if TYPE_CHECKING:
-    from streamtrack.mosaic.stream import PoseGraph
+    from streamtrack.mosaic.stream.growing import PoseGraph
 
 _CROP = 0.06
 """Share of the picture's sides that is given up on each side, to have room to move in."""

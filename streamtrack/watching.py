@@ -27,8 +27,8 @@ from streamtrack.types import Image, SourceInfo, Step
 from streamtrack.working_size import graph_in_full_size
 
 if TYPE_CHECKING:
-    from streamtrack.mosaic.export import Exported
-    from streamtrack.mosaic.stream import PoseGraph, StreamMosaic
+    from streamtrack.mosaic.stream.export import Exported
+    from streamtrack.mosaic.stream.growing import PoseGraph, StreamMosaic
     from streamtrack.recording.live_server import LiveAddress
     from streamtrack.recording.live_view import LiveView
     from streamtrack.recording.recorder import Recorder
@@ -163,7 +163,7 @@ def open_watchers(
     result.watchers.extend(display.log for display in displays)
     result.watchers.append(_camera_watcher(settings))
     if outputs.has_mosaic:
-        from streamtrack.mosaic.stream import StreamMosaic
+        from streamtrack.mosaic.stream.growing import StreamMosaic
 
         mosaic = stack.enter_context(StreamMosaic(settings.mosaic, graph))
         result.mosaic = MosaicWatcher(outputs.mosaic, mosaic, displays)

@@ -20,7 +20,7 @@ from streamtrack.ground import Ground
 from streamtrack.types import Frame, Matrix, Points, Step, Track
 
 if TYPE_CHECKING:
-    from streamtrack.mosaic.stream import PoseGraph
+    from streamtrack.mosaic.stream.growing import PoseGraph
 
 _WINDOW_S = 0.5
 """Velocities are means over this time."""

@@ -14,13 +14,14 @@ from conftest import MakePicture
 
 from streamtrack import geometry
 from streamtrack.errors import OutputError, UsageError
-from streamtrack.mosaic import bands, gains, painting, picture_files
-from streamtrack.mosaic.canvas import Canvas
-from streamtrack.mosaic.consensus import Chooser
-from streamtrack.mosaic.coverage import CellGrid, Footprint, footprint
+from streamtrack.mosaic import gains, picture_files
 from streamtrack.mosaic.picture_files import open_picture
 from streamtrack.mosaic.spill import SpillFile
-from streamtrack.mosaic.tiles import TILE_BYTES, tile_box, tile_keys
+from streamtrack.mosaic.stream import bands, painting
+from streamtrack.mosaic.stream.canvas import Canvas
+from streamtrack.mosaic.stream.consensus import Chooser
+from streamtrack.mosaic.stream.coverage import CellGrid, Footprint, footprint
+from streamtrack.mosaic.stream.tiles import TILE_BYTES, tile_box, tile_keys
 from streamtrack.types import Image, Matrix
 
 

@@ -12,8 +12,8 @@ import pytest
 from v4l2_emulator import Emulator, compiler
 
 from streamtrack.devices import Device, sizes_and_rates, to_json
-from streamtrack.sources._v4l2_formats import Mode, Rates
-from streamtrack.sources._v4l2_uri import parse_address
+from streamtrack.sources.v4l2.formats import Mode, Rates
+from streamtrack.sources.v4l2.uri import parse_address
 
 BY_ID = "/dev/v4l/by-id/usb-Emulated_Camera_40-video-index0"
 

@@ -20,7 +20,6 @@ from streamtrack.errors import SourceError, UsageError
 from streamtrack.meters import peak_rss_mb
 from streamtrack.settings import LiveSettings
 from streamtrack.sources import _backoff, _frame_queue
-from streamtrack.sources._arrival import ArrivalClock
 from streamtrack.sources._backoff import Backoff
 from streamtrack.sources._epoch_clock import EpochClock
 from streamtrack.sources._frame_queue import FrameQueue
@@ -33,6 +32,7 @@ from streamtrack.sources.capture import (
 )
 from streamtrack.sources.live import LiveSource
 from streamtrack.sources.live_status import LiveState
+from streamtrack.sources.network.arrival import ArrivalClock
 from streamtrack.types import Frame, Packet, SourceInfo
 from tests.servers import eventually
 

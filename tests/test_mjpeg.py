@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from v4l2_emulator import encoded
 
-from streamtrack.sources._mjpeg import JpegDecoder, whole_jpeg, with_tables
+from streamtrack.sources.v4l2.mjpeg import JpegDecoder, whole_jpeg, with_tables
 
 
 @pytest.fixture(scope="module")

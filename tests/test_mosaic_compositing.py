@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from streamtrack import geometry
-from streamtrack.mosaic.compositing import _tone_curve, band_count, painted_bands, plan
-from streamtrack.mosaic.exposure import compensation_gains, overlap_ncc
-from streamtrack.mosaic.projection import Canvas, View, lay_out, planar_views
-from streamtrack.mosaic.seams import SmallPatch, seam_masks
-from streamtrack.mosaic.warping import warp
+from streamtrack.mosaic.pictures.compositing import _tone_curve, band_count, painted_bands, plan
+from streamtrack.mosaic.pictures.exposure import compensation_gains, overlap_ncc
+from streamtrack.mosaic.pictures.projection import Canvas, View, lay_out, planar_views
+from streamtrack.mosaic.pictures.seams import SmallPatch, seam_masks
+from streamtrack.mosaic.pictures.warping import warp
 from streamtrack.settings import BLENDINGS, WARPINGS, MosaicSettings
 from streamtrack.types import Image
 

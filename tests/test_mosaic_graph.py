@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from streamtrack import geometry
-from streamtrack.mosaic.graph import (
+from streamtrack.mosaic.pictures.graph import (
     contradicted_links,
     largest_part,
     tree_poses,

@@ -24,7 +24,7 @@ from streamtrack.mosaic.job import (
     NoMosaicProgress,
     run_mosaic,
 )
-from streamtrack.mosaic.rotation import camera_matrix
+from streamtrack.mosaic.pictures.rotation import camera_matrix
 from streamtrack.mosaic.types import Status
 from streamtrack.settings import build_settings
 from streamtrack.types import Image, Matrix, Size

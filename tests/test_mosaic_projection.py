@@ -7,7 +7,7 @@ import pytest
 from test_mosaic_rotation import FOCAL, SIZE, turned
 
 from streamtrack import geometry
-from streamtrack.mosaic.projection import (
+from streamtrack.mosaic.pictures.projection import (
     Kind,
     View,
     field_of_view,
@@ -17,7 +17,7 @@ from streamtrack.mosaic.projection import (
     planar_views,
     turned_views,
 )
-from streamtrack.mosaic.rotation import Rotations, camera_matrix
+from streamtrack.mosaic.pictures.rotation import Rotations, camera_matrix
 from streamtrack.types import Matrix
 
 KINDS: tuple[Kind, ...] = ("planar", "cylindrical", "spherical")

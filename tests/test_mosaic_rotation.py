@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from streamtrack import geometry
-from streamtrack.mosaic import rotation
-from streamtrack.mosaic.rotation import (
+from streamtrack.mosaic.pictures import rotation
+from streamtrack.mosaic.pictures.rotation import (
     Rotations,
     adjust_rotations,
     camera_matrix,

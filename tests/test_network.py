@@ -33,7 +33,7 @@ from streamtrack.sources.capture import (
     CaptureRefusedError,
 )
 from streamtrack.sources.live import LiveSource
-from streamtrack.sources.network import NetworkCapture
+from streamtrack.sources.network.stream import NetworkCapture
 from streamtrack.sources.video import VideoSource
 from tests import rtsp_server, servers
 from tests.servers import Server, eventually, jpeg, mjpeg, number_of, part, silence
@@ -267,7 +267,7 @@ def test_a_reader_that_dies_or_freezes_neither_hangs_nor_stays() -> None:
 
 def test_a_reader_ends_with_its_user() -> None:
     program = (
-        "import os, sys; from streamtrack.sources.network import NetworkCapture; "
+        "import os, sys; from streamtrack.sources.network.stream import NetworkCapture; "
         "c = NetworkCapture(sys.argv[1]); c.read(5); print(c.reader_pid, flush=True); "
         "os.kill(os.getpid(), 9)"
     )
@@ -282,7 +282,7 @@ def test_a_reader_ends_with_its_user() -> None:
 
 def test_a_reader_is_light() -> None:
     program = (
-        "import sys, streamtrack.sources._reader_process; "
+        "import sys, streamtrack.sources.network.reader_process; "
         "print(*{'numpy', 'cv2', 'pydantic', 'rerun'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=30)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from v4l2_emulator import default_picture, encoded
 
-from streamtrack.sources._pixels import Layout, to_picture
+from streamtrack.sources.v4l2.pixels import Layout, to_picture
 
 
 @pytest.mark.parametrize("is_full_range", [False, True], ids=["limited", "full"])

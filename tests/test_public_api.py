@@ -45,7 +45,7 @@ def test_unknown_name_is_an_attribute_error() -> None:
         ("streamtrack.cli", ("cv2", "av", "rerun", "numpy", "pydantic", "rich")),
         ("streamtrack.sources", ("cv2", "av", "rerun")),
         ("streamtrack.pipeline", ("av", "rerun", "typer")),
-        ("streamtrack.mosaic.pictures", ("av", "rerun", "typer", "pyarrow", "rich", "scipy")),
+        ("streamtrack.mosaic.pictures.job", ("av", "rerun", "typer", "pyarrow", "rich", "scipy")),
         ("streamtrack.job", ("av", "rerun", "typer", "pyarrow")),
     ],
 )

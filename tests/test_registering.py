@@ -12,12 +12,12 @@ from streamtrack.errors import UsageError
 from streamtrack.evaluation import corner_error, visible_error
 from streamtrack.features import no_features
 from streamtrack.fitting import fit, transfer_errors
-from streamtrack.mosaic import direct
-from streamtrack.mosaic.agreement import Agreement, measure_agreement
-from streamtrack.mosaic.first_estimate import estimate, estimate_by_zoom
-from streamtrack.mosaic.link_gate import corner_sigma_px, judge_link, overlap_in
-from streamtrack.mosaic.registering import PictureRegistrar
-from streamtrack.mosaic.subpixel import render_overlap, tracked_corners
+from streamtrack.mosaic.pairs import direct
+from streamtrack.mosaic.pairs.agreement import Agreement, measure_agreement
+from streamtrack.mosaic.pairs.first_estimate import estimate, estimate_by_zoom
+from streamtrack.mosaic.pairs.link_gate import corner_sigma_px, judge_link, overlap_in
+from streamtrack.mosaic.pairs.registering import PictureRegistrar
+from streamtrack.mosaic.pairs.subpixel import render_overlap, tracked_corners
 from streamtrack.mosaic.types import Link
 from streamtrack.pyramid import Pyramid
 from streamtrack.settings import Settings, build_settings

@@ -20,10 +20,10 @@ from streamtrack import geometry
 from streamtrack import job as jobs
 from streamtrack.errors import OutputError, SourceError, UsageError
 from streamtrack.mosaic.job import MosaicJob, MosaicOutcome, MosaicOutputs, NoMosaicProgress
-from streamtrack.mosaic.stream import StreamMosaic
-from streamtrack.mosaic.stream_job import run_stream_mosaic
+from streamtrack.mosaic.stream.growing import StreamMosaic
+from streamtrack.mosaic.stream.job import run_stream_mosaic
 from streamtrack.settings import MosaicSettings, build_settings
-from streamtrack.sources.rendering import Ground
+from streamtrack.sources.scenes.rendering import Ground
 from streamtrack.sources.synthetic import SyntheticSource
 from streamtrack.types import CameraPose, Frame, Image, Matrix, Track, TrackState
 

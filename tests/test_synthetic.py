@@ -16,8 +16,8 @@ import pytest
 from streamtrack import geometry
 from streamtrack.errors import OutputError, UsageError
 from streamtrack.sources.base import FrameSource
-from streamtrack.sources.motion import stream
 from streamtrack.sources.scenes.catalogue import SCENES
+from streamtrack.sources.scenes.motion import stream
 from streamtrack.sources.scenes.scene import covered
 from streamtrack.sources.synthetic import SyntheticSource
 from streamtrack.synth import HEADER, write_synthetic

@@ -30,9 +30,9 @@ from v4l2_emulator import (
 )
 
 from streamtrack.errors import SourceError, UsageError
-from streamtrack.sources import _v4l2_api as api
-from streamtrack.sources._v4l2_stream import DriverClock, lost_between
-from streamtrack.sources.v4l2 import V4L2Capture
+from streamtrack.sources.v4l2 import api
+from streamtrack.sources.v4l2.camera import V4L2Capture
+from streamtrack.sources.v4l2.stream import DriverClock, lost_between
 
 CHILD = Path(__file__).with_name("v4l2_child.py")
 TIMEOUT_S = 120

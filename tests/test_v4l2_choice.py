@@ -8,10 +8,10 @@ from fractions import Fraction
 import pytest
 
 from streamtrack.errors import UsageError
-from streamtrack.sources._v4l2_choice import Wanted, choose, rate_to_ask
-from streamtrack.sources._v4l2_formats import Mode, Rates, sizes_in_range
-from streamtrack.sources._v4l2_uri import parse_address, uri_of
-from streamtrack.sources.v4l2 import Granted, differences
+from streamtrack.sources.v4l2.camera import Granted, differences
+from streamtrack.sources.v4l2.choice import Wanted, choose, rate_to_ask
+from streamtrack.sources.v4l2.formats import Mode, Rates, sizes_in_range
+from streamtrack.sources.v4l2.uri import parse_address, uri_of
 
 HD = (1280, 720)
 VGA = (640, 480)

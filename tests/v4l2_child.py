@@ -25,7 +25,7 @@ from v4l2_emulator import DEFAULT_FRAMES, EmulatedCamera, decode_number, default
 
 from streamtrack.errors import StreamtrackError
 from streamtrack.sources.capture import Captured, CaptureEndedError
-from streamtrack.sources.v4l2 import V4L2Capture
+from streamtrack.sources.v4l2.camera import V4L2Capture
 
 SCENARIOS: dict[str, Callable[[str, EmulatedCamera], dict[str, Any]]] = {}
 
@@ -238,7 +238,7 @@ def openings(uri: str, camera: EmulatedCamera) -> dict[str, Any]:
 def busy(uri: str, camera: EmulatedCamera) -> dict[str, Any]:
     """Another program streams from the same camera."""
     code = (
-        "import sys; from streamtrack.sources.v4l2 import V4L2Capture\n"
+        "import sys; from streamtrack.sources.v4l2.camera import V4L2Capture\n"
         "with V4L2Capture(sys.argv[1]): print('ready', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen(

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from streamtrack.features import COMPATIBLE
 from streamtrack.geometry import grey_of
-from streamtrack.mosaic.registering import PictureRegistrar
+from streamtrack.mosaic.pairs.registering import PictureRegistrar
 from streamtrack.settings import build_settings
 from streamtrack.types import Image, Matrix, Points
 

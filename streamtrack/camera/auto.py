@@ -28,7 +28,8 @@ _STILL_PX = 0.75
 _DOUBT_PX = 0.5
 _BEGINS, _STAYS = 0.12, 0.07
 """Shares of the textured cells that must be where they were for a camera to be found at rest, and
-for one at rest to be so still. They do not decide alone: of clips from a hand in motion two had 0.04, one 0.25."""
+for one at rest to be so still. They do not decide alone: of clips from a moving hand two had 0.04,
+one 0.25."""
 _STILL_FRAMES = 25
 _MOST_STILL_FRAMES = 400
 _OTHER_FRAMES = 5  # in a row: something large may pass by

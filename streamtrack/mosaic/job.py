@@ -81,14 +81,14 @@ def run_mosaic(
 
     Raises StreamtrackError if it cannot even start or an output cannot be written.
     """
-    from streamtrack.mosaic.inputs import is_stream
+    from streamtrack.mosaic.pictures.inputs import is_stream
 
     if len(job.inputs) == 1 and is_stream(job.inputs[0]):
-        from streamtrack.mosaic.stream_job import run_stream_mosaic
+        from streamtrack.mosaic.stream.job import run_stream_mosaic
 
         return run_stream_mosaic(job, progress, should_stop)
     if job.outputs.live is not None:
         raise UsageError("--live shows a stream as it goes, and these are pictures: leave it out")
-    from streamtrack.mosaic.pictures import run_picture_mosaic
+    from streamtrack.mosaic.pictures.job import run_picture_mosaic
 
     return run_picture_mosaic(job, progress, should_stop)

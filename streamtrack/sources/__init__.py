@@ -67,7 +67,7 @@ def _camera(
     uri: str, live: LiveSettings | None, should_stop: Callable[[], bool] | None
 ) -> FrameSource:
     from streamtrack.sources.live import LiveSource
-    from streamtrack.sources.v4l2 import V4L2Capture
+    from streamtrack.sources.v4l2.camera import V4L2Capture
 
     return LiveSource(lambda _: V4L2Capture(uri), live, name=uri, should_stop=should_stop)
 
@@ -80,7 +80,7 @@ def _stream(
 ) -> FrameSource:
     from streamtrack.settings import LiveSettings
     from streamtrack.sources.live import LiveSource
-    from streamtrack.sources.network import NetworkCapture
+    from streamtrack.sources.network.stream import NetworkCapture
 
     settings = live or LiveSettings()
     name = redacted(uri)

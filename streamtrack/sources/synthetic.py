@@ -27,9 +27,9 @@ import numpy as np
 
 from streamtrack.errors import UsageError, unknown_name
 from streamtrack.geometry import inverted, transform_points
-from streamtrack.sources.motion import stream
-from streamtrack.sources.rendering import Box, Floats, Ground, NoiseBank, laid_over
 from streamtrack.sources.scenes.catalogue import RECIPES, SCENES, TEXTURES, Request, build
+from streamtrack.sources.scenes.motion import stream
+from streamtrack.sources.scenes.rendering import Box, Floats, Ground, NoiseBank, laid_over
 from streamtrack.sources.scenes.scene import Layer
 from streamtrack.types import Frame, Image, Matrix, Points, Size, Skipped, SourceInfo
 

@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 
 from streamtrack.geometry import box_quad, normalized, translation
-from streamtrack.sources.motion import (
+from streamtrack.sources.scenes import circuit, desk, prints, roadside, terrain, traffic
+from streamtrack.sources.scenes.motion import (
     Path,
     Reach,
     absences,
@@ -22,10 +23,9 @@ from streamtrack.sources.motion import (
     stream,
     wander,
 )
-from streamtrack.sources.rendering import Ground, Sprite, premultiplied
-from streamtrack.sources.scenes import circuit, desk, prints, roadside, terrain, traffic
+from streamtrack.sources.scenes.rendering import Ground, Sprite, premultiplied
 from streamtrack.sources.scenes.scene import Layer, Light, Pass, Passing, Scene
-from streamtrack.sources.travel import MatrixAt, drive, flight_view
+from streamtrack.sources.scenes.travel import MatrixAt, drive, flight_view
 from streamtrack.types import Image, Matrix, Points, Size
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from streamtrack.sources.rendering import premultiplied
 from streamtrack.sources.scenes.canvas import (
     Colour,
     box,
@@ -24,6 +23,7 @@ from streamtrack.sources.scenes.canvas import (
     write,
 )
 from streamtrack.sources.scenes.prints import paint_book, paint_letter
+from streamtrack.sources.scenes.rendering import premultiplied
 from streamtrack.types import Image, Size
 
 CANVAS_WIDTH = 1280

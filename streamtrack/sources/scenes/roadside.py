@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from streamtrack.sources.rendering import Ground, over, premultiplied
 from streamtrack.sources.scenes.canvas import (
     Colour,
     box,
@@ -20,6 +19,7 @@ from streamtrack.sources.scenes.canvas import (
     tinted,
     varied,
 )
+from streamtrack.sources.scenes.rendering import Ground, over, premultiplied
 from streamtrack.sources.scenes.terrain import paint_house, paint_tree
 from streamtrack.types import Image, Size
 

@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.geometry import inverted, transform_points
-from streamtrack.sources.motion import Pose, Wave, eased, homography, smooth_step, stream
-from streamtrack.sources.rendering import Floats, Ground, Sprite
-from streamtrack.sources.travel import MatrixAt
+from streamtrack.sources.scenes.motion import Pose, Wave, eased, homography, smooth_step, stream
+from streamtrack.sources.scenes.rendering import Floats, Ground, Sprite
+from streamtrack.sources.scenes.travel import MatrixAt
 from streamtrack.types import Image, Matrix, Points, Size
 
 GRID = 64

@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 
 from streamtrack.geometry import normalized, translation
-from streamtrack.sources.motion import Pose, Wave, eased, homography, smooth_step, stream
-from streamtrack.sources.rendering import Sprite
 from streamtrack.sources.scenes import roadside
+from streamtrack.sources.scenes.motion import Pose, Wave, eased, homography, smooth_step, stream
+from streamtrack.sources.scenes.rendering import Sprite
 from streamtrack.sources.scenes.scene import Layer
-from streamtrack.sources.travel import MatrixAt
+from streamtrack.sources.scenes.travel import MatrixAt
 from streamtrack.types import Matrix, Size
 
 LANES = 4

@@ -1,0 +1,1 @@
+"""How two pictures lie to each other, and whether that may be believed."""

@@ -1,0 +1,1 @@
+"""A mosaic of pictures: which belong together, where each lies, and one picture of all."""

@@ -1,0 +1,1 @@
+"""Streams over the network, read by a process that can be killed."""

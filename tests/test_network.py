@@ -588,9 +588,10 @@ def test_secrets_of_an_address_appear_nowhere(
             servers.protected("nutzer", "geheimnis", camera)(connection)
         else:
             connection.recv(65536)
+            has_looked.wait(60)  # the program ends with this answer
             connection.sendall(b"HTTP/1.0 404 Not Found\r\nContent-Length: 0\r\n\r\n")
 
-    titles = b""
+    titles, has_looked = b"", threading.Event()
     with Server(handle) as server:
         address = f"http://nutzer:geheimnis@127.0.0.1:{server.port}/{leaf}?token=abrakadabra"
         outputs = ("--output", "tracks.csv", "--poses", "poses.csv", "--summary", "summary.json")
@@ -608,6 +609,7 @@ def test_secrets_of_an_address_appear_nowhere(
             for pid in (program.pid, *_processes_below(program.pid)):
                 with contextlib.suppress(OSError):
                     titles += Path(f"/proc/{pid}/cmdline").read_bytes()
+            has_looked.set()
             said = program.stdout.read()
     assert b"127.0.0.1" in titles
     assert b"127.0.0.1" in said

@@ -341,6 +341,16 @@ def test_auto_finds_out_that_a_camera_stands(make_picture: MakePicture) -> None:
     assert max(corner_error(pose.world_from_frame, np.eye(3), SIZE) for pose in found) < 0.2
 
 
+def test_the_graph_knows_where_the_frames_of_a_standing_camera_lie(
+    make_picture: MakePicture,
+) -> None:
+    camera, found = run_auto(fixed_clip(make_picture, [(0, 0)] * 60))
+    for index, pose in enumerate(found):
+        known = camera.graph.world_from_frame(index)
+        assert known is not None
+        assert corner_error(known, pose.world_from_frame, SIZE) < 0.01
+
+
 def test_auto_is_not_carried_along_by_traffic(make_picture: MakePicture) -> None:
     """Two thirds of the view flow by; what stands between them tells that the camera does."""
     ground, traffic = make_picture(31, SIZE), make_picture(32, (1000, 240))

@@ -143,9 +143,8 @@ class AutoCamera:
         return self._unmoved(found, standing, view)
 
     def _unmoved(self, found: CameraPose, standing: _Standing, view: FrameView) -> CameraPose:
-        if len(self.graph.keyframes) > 1:  # which may come to lie elsewhere, and the frame too
-            keyframe, keyframe_from_frame = standing.keyframe, standing.keyframe_from_frame
-            self.graph.add_frame(view.frame.index, keyframe, keyframe_from_frame)
+        keyframe, keyframe_from_frame = standing.keyframe, standing.keyframe_from_frame
+        self.graph.add_frame(view.frame.index, keyframe, keyframe_from_frame)
         pose = standing.pose(self.graph)
         return replace(found, world_from_frame=pose, kind=CameraKind.FIXED)
 

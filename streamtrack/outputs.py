@@ -10,12 +10,10 @@ import csv
 import errno
 import io
 import os
-from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
+from streamtrack.closing import Closing
 from streamtrack.errors import OutputError
 
 _ADVICE = {
@@ -82,30 +80,6 @@ def csv_line(cells: Iterable[str]) -> str:
     buffer = io.StringIO()
     csv.writer(buffer, lineterminator="\r\n").writerow(cells)
     return buffer.getvalue().removesuffix("\r\n") + "\n"
-
-
-class Closing(ABC):
-    """Leaving the context closes; an error then is a note on the one that is under way, if any."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Complete the file; further calls do nothing. Raises OutputError."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        try:
-            self.close()
-        except OutputError as error:
-            if exc is None:
-                raise
-            exc.add_note(str(error))
 
 
 class RecordFile(Closing):

@@ -25,10 +25,10 @@ from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
+from streamtrack.closing import Closing
 from streamtrack.errors import UsageError
 from streamtrack.geometry import bounding_box
 from streamtrack.outputs import (
-    Closing,
     RecordFile,
     csv_line,
     encodable,

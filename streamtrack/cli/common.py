@@ -10,7 +10,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+
+import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -18,8 +20,34 @@ if TYPE_CHECKING:
     from streamtrack.settings import Settings
 
 _PIPED_WIDTH = 200
-DETECTORS = "harris, fast, agast, gftt, brisk, orb, sift, akaze"
-DESCRIPTORS = "freak, brisk, orb, teblid, sift, akaze"
+
+# Options that `track` and `mosaic` share.
+DetectorOption: TypeAlias = Annotated[
+    str | None, typer.Option(help="harris, fast, agast, gftt, brisk, orb, sift, akaze.")
+]
+ThresholdOption: TypeAlias = Annotated[
+    float | None, typer.Option(help="The detector's own threshold.")
+]
+DescriptorOption: TypeAlias = Annotated[
+    str | None, typer.Option(help="freak, brisk, orb, teblid, sift, akaze.")
+]
+ModelOption: TypeAlias = Annotated[
+    str | None,
+    typer.Option(help="auto, homography, affine, similarity or translation."),
+]
+MaxFpsOption: TypeAlias = Annotated[
+    float | None, typer.Option(help="Leave out pictures of a live source beyond this rate.")
+]
+RetriesOption: TypeAlias = Annotated[
+    int | None,
+    typer.Option(min=0, help="Openings of a live source in a row; default for ever."),
+]
+NoRecordOption: TypeAlias = Annotated[bool, typer.Option("--no-record", help="Make no recording.")]
+SummaryOption: TypeAlias = Annotated[Path | None, typer.Option(help="Summary as JSON.")]
+SettingsOption: TypeAlias = Annotated[
+    Path | None, typer.Option(help="Settings as TOML; flags win.")
+]
+QuietOption: TypeAlias = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 
 
 def merged_settings(path: Path | None, flags: dict[str, Any]) -> Settings:

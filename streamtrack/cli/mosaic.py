@@ -9,9 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from streamtrack.cli.common import (
-    DESCRIPTORS,
-    DETECTORS,
+    DescriptorOption,
+    DetectorOption,
+    MaxFpsOption,
+    ModelOption,
+    NoRecordOption,
+    QuietOption,
+    RetriesOption,
+    SettingsOption,
     StopOnSignal,
+    SummaryOption,
+    ThresholdOption,
     merged_settings,
 )
 from streamtrack.cli.plain import plain_summary, stage_progress_for, warnings_on_stderr
@@ -35,13 +43,10 @@ def mosaic(
         Path | None,
         typer.Option("--output", "-o", help="The mosaic: .png, .jpg, .tif, .webp or .bmp."),
     ] = None,
-    detector: Annotated[str | None, typer.Option(help=f"{DETECTORS}.")] = None,
-    threshold: Annotated[float | None, typer.Option(help="The detector's own threshold.")] = None,
-    descriptor: Annotated[str | None, typer.Option(help=f"{DESCRIPTORS}.")] = None,
-    model: Annotated[
-        str | None,
-        typer.Option(help="auto, homography, affine, similarity or translation."),
-    ] = None,
+    detector: DetectorOption = None,
+    threshold: ThresholdOption = None,
+    descriptor: DescriptorOption = None,
+    model: ModelOption = None,
     warping: Annotated[
         str | None, typer.Option(help="Backward: nearest, linear, cubic or lanczos.")
     ] = None,
@@ -62,11 +67,11 @@ def mosaic(
         typer.Option(help="Text with the true homography, first picture to second: nine numbers."),
     ] = None,
     poses: Annotated[Path | None, typer.Option(help="CSV of where each picture lies.")] = None,
-    summary: Annotated[Path | None, typer.Option(help="Summary as JSON.")] = None,
+    summary: SummaryOption = None,
     record: Annotated[
         Path | None, typer.Option(help="Recording for the Rerun viewer (.rrd).")
     ] = None,
-    no_record: Annotated[bool, typer.Option("--no-record", help="Make no recording.")] = False,
+    no_record: NoRecordOption = False,
     live: Annotated[
         str | None,
         typer.Option(
@@ -75,18 +80,13 @@ def mosaic(
             "127.0.0.1:9876 if no address follows.",
         ),
     ] = None,
-    max_fps: Annotated[
-        float | None, typer.Option(help="Leave out pictures of a live source beyond this rate.")
-    ] = None,
-    retries: Annotated[
-        int | None,
-        typer.Option(min=0, help="Openings of a live source in a row; default for ever."),
-    ] = None,
-    settings: Annotated[Path | None, typer.Option(help="Settings as TOML; flags win.")] = None,
+    max_fps: MaxFpsOption = None,
+    retries: RetriesOption = None,
+    settings: SettingsOption = None,
     start: Annotated[int, typer.Option(min=0, help="First frame or picture, from 0.")] = 0,
     step: Annotated[int, typer.Option(min=1, help="Use every n-th.")] = 1,
     frames: Annotated[int | None, typer.Option(min=1, help="Use at most n.")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Join pictures, or the frames of a stream, into one picture, and say how well they fit."""
     if not any((output, poses, summary, record, live is not None)):

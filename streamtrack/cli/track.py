@@ -8,9 +8,17 @@ from typing import Annotated
 import typer
 
 from streamtrack.cli.common import (
-    DESCRIPTORS,
-    DETECTORS,
+    DescriptorOption,
+    DetectorOption,
+    MaxFpsOption,
+    ModelOption,
+    NoRecordOption,
+    QuietOption,
+    RetriesOption,
+    SettingsOption,
     StopOnSignal,
+    SummaryOption,
+    ThresholdOption,
     consoles,
     default_recording,
     merged_settings,
@@ -74,18 +82,15 @@ def track(
             "fitted by least squares. Adds the same columns.",
         ),
     ] = None,
-    detector: Annotated[str | None, typer.Option(help=f"{DETECTORS}.")] = None,
-    threshold: Annotated[float | None, typer.Option(help="The detector's own threshold.")] = None,
-    descriptor: Annotated[str | None, typer.Option(help=f"{DESCRIPTORS}.")] = None,
-    model: Annotated[
-        str | None,
-        typer.Option(help="auto, homography, affine, similarity or translation."),
-    ] = None,
+    detector: DetectorOption = None,
+    threshold: ThresholdOption = None,
+    descriptor: DescriptorOption = None,
+    model: ModelOption = None,
     record: Annotated[
         Path | None,
         typer.Option(help="Recording; default recordings/<source>-<start time>.rrd."),
     ] = None,
-    no_record: Annotated[bool, typer.Option("--no-record", help="Make no recording.")] = False,
+    no_record: NoRecordOption = False,
     record_video: Annotated[
         str | None,
         typer.Option(help="Picture in the recording: auto (copy packets), jpeg, av1 or none."),
@@ -135,19 +140,14 @@ def track(
             help="Work on wider pictures at this width; results stay in pixels of the source.",
         ),
     ] = None,
-    max_fps: Annotated[
-        float | None, typer.Option(help="Leave out pictures of a live source beyond this rate.")
-    ] = None,
-    retries: Annotated[
-        int | None,
-        typer.Option(min=0, help="Openings of a live source in a row; default for ever."),
-    ] = None,
-    summary: Annotated[Path | None, typer.Option(help="Summary as JSON.")] = None,
-    settings: Annotated[Path | None, typer.Option(help="Settings as TOML; flags win.")] = None,
+    max_fps: MaxFpsOption = None,
+    retries: RetriesOption = None,
+    summary: SummaryOption = None,
+    settings: SettingsOption = None,
     start: Annotated[int, typer.Option(min=0, help="First frame, counted from 0.")] = 0,
     step: Annotated[int, typer.Option(min=1, help="Use every n-th frame.")] = 1,
     frames: Annotated[int | None, typer.Option(min=1, help="Use at most n frames.")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Follow targets through a video and write a recording, tables and a summary."""
     from streamtrack.ground import make_ground, parse_ground

@@ -17,12 +17,11 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from types import TracebackType
-from typing import Self
 
 import rerun as rr
 import rerun_bindings
 
+from streamtrack.closing import Closing
 from streamtrack.errors import OutputError
 from streamtrack.geometry import inverted, scaling
 from streamtrack.mosaic.types import MosaicView
@@ -52,7 +51,7 @@ _LAST_LOOK_S = 0.2
 """Left to the process to hand on what came last, before it is ended."""
 
 
-class LiveView:
+class LiveView(Closing):
     """Shows each `Step` of a run to whoever connects; takes what a `Recorder` takes.
 
     Every call returns at once. ``dropped`` counts what was not shown because the viewer's side
@@ -100,17 +99,6 @@ class LiveView:
         except OutputError:
             self.close()
             raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def log(self, step: Step) -> None:
         """Show all that one frame produced, unless the one before was shown just now."""

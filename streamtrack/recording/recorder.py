@@ -13,9 +13,8 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
+from streamtrack.closing import Closing
 from streamtrack.errors import OutputError
 from streamtrack.mosaic.types import MosaicView
 from streamtrack.recording import blueprint
@@ -50,7 +49,7 @@ _LEVELS = {
 }
 
 
-class Recorder:
+class Recorder(Closing):
     """Writes each `Step` of a run to an .rrd file, with the layout to view it in.
 
     With ``settings.recording.rotate`` it becomes a series of files beside ``path``, each complete
@@ -102,17 +101,6 @@ class Recorder:
         if self._series is not None:
             reserve = 0 if self._rotate is None else self._rotate.size_bytes or 0
             self._tidier = _Tidier(self._series, keep, reserve)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     @property
     def is_recording(self) -> bool:

@@ -6,9 +6,9 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from types import TracebackType
-from typing import Self, TypeAlias
+from typing import TypeAlias
 
+from streamtrack.closing import Closing
 from streamtrack.errors import SourceError, StreamtrackError, UsageError
 from streamtrack.settings import LiveSettings
 from streamtrack.sources._backoff import Backoff
@@ -42,7 +42,7 @@ class _FileBrokeOffError(SourceError):
     """A file that broke off is not begun again: its frames would come twice."""
 
 
-class LiveSource:
+class LiveSource(Closing):
     """A camera or network stream as a `FrameSource`, read by a thread of its own.
 
     The frame given is the newest one (see `FrameQueue`); what the caller has no time for is
@@ -168,17 +168,6 @@ class LiveSource:
             self._thread.join(_JOIN_TIMEOUT_S)
             if self._thread.is_alive():
                 _log.warning("%s: the device does not let go: left to itself", self._name)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     # -- the capturing thread -------------------------------------------------------------------
 

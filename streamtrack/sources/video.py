@@ -6,14 +6,13 @@ import logging
 import math
 from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import av
 from av.packet import Packet as AvPacket
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
+from streamtrack.closing import Closing
 from streamtrack.errors import SourceError
 from streamtrack.sources._av import PictureMaker, open_file
 from streamtrack.sources._clock import Clock, duration_s, frame_count, rate_hz
@@ -25,7 +24,7 @@ _log = logging.getLogger("streamtrack.sources")
 _MAX_DEMUX_ERRORS = 20
 
 
-class VideoSource:
+class VideoSource(Closing):
     """A video file, decoded frame by frame.
 
     ``Frame.time_s`` is pts x time base minus the stream's start, so the first frame is at 0
@@ -85,17 +84,6 @@ class VideoSource:
     def shortfall(self) -> str:
         """After the last frame: how much shorter the file is than its header says, or empty."""
         return self._shortfall
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Release the file. May be called again; reading afterwards raises SourceError."""

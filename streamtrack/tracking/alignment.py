@@ -74,6 +74,11 @@ def agreeing_share(alignment: Alignment) -> float:
     return found.inliers / len(found.is_inlier)
 
 
+def seen_share(alignment: Alignment) -> float:
+    """Share (0..1) of all points, those out of view among them, that agree with the pose."""
+    return alignment.registration.inliers / len(alignment.is_in_view)
+
+
 def patch_for(template: Template, frame_from_template: Matrix) -> int:
     """Index of the patch whose resolution fits the target's size in the frame."""
     magnification = geometry.local_scale(frame_from_template, template.centre)

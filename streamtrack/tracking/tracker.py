@@ -18,7 +18,14 @@ from streamtrack.frame_view import FrameView
 from streamtrack.matching import match, match_guided
 from streamtrack.registration import refused, register
 from streamtrack.settings import Settings
-from streamtrack.tracking.alignment import CLEAR, Alignment, Hope, agreeing_share, withdrawn
+from streamtrack.tracking.alignment import (
+    CLEAR,
+    Alignment,
+    Hope,
+    agreeing_share,
+    seen_share,
+    withdrawn,
+)
 from streamtrack.tracking.appearance import (
     MAX_CHROMA_DISTANCE,
     MAX_CHROMA_DISTANCE_OTHER_CAMERA,
@@ -190,7 +197,7 @@ class HybridTracker:
         followed = self._plausible(self._align_first(view, guess), guess)
         found = followed.registration
         if found.b_from_a is not None and self._frames_lost == 0:
-            share = found.inliers / len(followed.is_in_view)
+            share = seen_share(followed)
             if share >= _CLEAR_VIEW_SHARE:
                 self._doubt_px = 0.0
             elif share < _THIN_SHARE:
@@ -201,7 +208,7 @@ class HybridTracker:
 
     def _is_clear(self, alignment: Alignment) -> bool:
         """Is so much of the target seen that the frame teaches how good predictions are?"""
-        return alignment.registration.inliers >= _CLEAR_VIEW_SHARE * len(alignment.is_in_view)
+        return seen_share(alignment) >= _CLEAR_VIEW_SHARE
 
     def _align_first(self, view: FrameView, guess: Matrix) -> Alignment:
         """The first view in the frame: near the guess if that should be good, else farther off.
@@ -347,7 +354,7 @@ class HybridTracker:
             self._prediction.begin_at(found.b_from_a, share)
             self._doubt_px = 0.0
         self._last_share = share if means != "view" else 0.0
-        self._last_seen = found.inliers / len(alignment.is_in_view)
+        self._last_seen = seen_share(alignment)
         self._frames_lost = self._searches = 0
         self._was_seen = True
         evidence = Evidence(alignment.template_points, alignment.frame_points, found.is_inlier)

@@ -15,13 +15,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol
 
 import cv2
 import numpy as np
 
 from streamtrack import geometry
+from streamtrack.closing import Closing
 from streamtrack.errors import OutputError
 from streamtrack.mosaic.spill import SpillFile
 from streamtrack.mosaic.stream import painting
@@ -104,7 +104,7 @@ class _Waiting:
     new: float
 
 
-class StreamMosaic:
+class StreamMosaic(Closing):
     """A mosaic that grows frame by frame; a context manager that leaves nothing behind.
 
     ``graph`` gives poses that may still change (loop closure); without it the poses that come
@@ -133,17 +133,6 @@ class StreamMosaic:
         self._full = ""
         self._has_painted = False
         self.figures = StreamFigures()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Give memory and disk back; further calls do nothing."""

@@ -12,11 +12,11 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
+from streamtrack.closing import Closing
 from streamtrack.errors import SourceError, UsageError
 from streamtrack.settings import LiveSettings
 from streamtrack.sources.addresses import STDIN, Redactor, check_network_address, redacted
@@ -37,7 +37,7 @@ _PROTOCOLS = "rtsp,rtp,srtp,udp,tcp,tls,http,https,httpproxy,crypto,srt,rtmp,rtm
 """All that an address, or a playlist that it leads to, may open: no local files."""
 
 
-class NetworkCapture:
+class NetworkCapture(Closing):
     """An open network stream or pipe; implements `streamtrack.sources.capture.Capture`.
 
     ``rtsp``, ``rtsps`` (over TCP unless ``settings`` say UDP), ``http`` and ``https`` (MJPEG, HLS,
@@ -141,17 +141,6 @@ class NetworkCapture:
             while self._messages.receive(_GOODBYE_S) is not None:
                 pass
         self._kill()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     # -- opening --------------------------------------------------------------------------------
 

@@ -15,9 +15,8 @@ import threading
 import time
 from dataclasses import dataclass
 from fractions import Fraction
-from types import TracebackType
-from typing import Self
 
+from streamtrack.closing import Closing
 from streamtrack.errors import SourceError
 from streamtrack.sources.capture import Captured, CaptureEndedError
 from streamtrack.sources.v4l2 import api
@@ -62,7 +61,7 @@ class Granted:
         return f"{self.size_wh[0]}x{self.size_wh[1]} {FORMATS.get(self.fourcc, self.fourcc)}{rate}"
 
 
-class V4L2Capture:
+class V4L2Capture(Closing):
     """An open camera; implements `streamtrack.sources.capture.Capture`.
 
     Frames are stamped by the driver: ``time_s`` and ``captured_s`` are both seconds of
@@ -167,17 +166,6 @@ class V4L2Capture:
         thread.join(_CLOSE_TIMEOUT_S)
         if thread.is_alive():
             _log.warning("%s does not stop: its driver hangs; it is left to itself", self._path)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _opened(self) -> Granted:
         """Open the device, bring it to what is wanted and start it. Raises OSError too."""

@@ -23,7 +23,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,94 +33,10 @@ from streamtrack.meters import LogHistogram, Mean, nearest_rank, peak_rss_mb
 from streamtrack.settings import Settings
 from streamtrack.sources.live_status import LiveStatus
 from streamtrack.summary_text import cell, markdown, number, write_json
+from streamtrack.target_summary import TargetSummary, TargetSums
 from streamtrack.types import AUTO_STAGE, Size, Skipped, SourceInfo, Step, Track, TrackState
 
 _MOST_FOUND = 1000
-
-
-@dataclass(frozen=True, slots=True)
-class TargetSummary:
-    """One target: frames in each state, and means over the frames in which it was tracked.
-
-    ``first_seen`` is the index of the first frame in which it was tracked, ``models`` counts
-    frames a transformation model. What was never measured is None.
-    """
-
-    name: str
-    frames_tracked: int
-    frames_lost: int
-    frames_searching: int
-    losses: int
-    first_seen: int | None
-    rmse_px: float | None
-    matches: float | None
-    inliers: float | None
-    models: dict[str, int]
-    last_seen: int | None = None
-    is_found: bool = False
-
-    @property
-    def share(self) -> float:
-        """Share (0..1) of the frames since the target was given in which it was tracked."""
-        frames = self.frames_tracked + self.frames_lost + self.frames_searching
-        return self.frames_tracked / frames if frames else 0.0
-
-    def to_text(self) -> str:
-        """All of it in one line."""
-        frames = self.frames_tracked + self.frames_lost + self.frames_searching
-        seen = "never seen" if self.first_seen is None else f"first seen in frame {self.first_seen}"
-        return (
-            f"tracked {self.frames_tracked} of {frames} ({self.share:.1%}), "
-            f"lost {self.frames_lost}, searching {self.frames_searching}, "
-            f"losses {self.losses}, {seen}, RMSE {number(self.rmse_px, 2, ' px')}"
-        )
-
-
-@dataclass(slots=True)
-class _TargetSums:
-    name: str
-    states: Counter[TrackState] = field(default_factory=Counter)
-    losses: int = 0
-    last: TrackState | None = None
-    first_seen: int | None = None
-    rmse_px: Mean = field(default_factory=Mean)
-    matches: Mean = field(default_factory=Mean)
-    inliers: Mean = field(default_factory=Mean)
-    models: Counter[str] = field(default_factory=Counter)
-    last_seen: int | None = None
-    is_found: bool = False
-
-    def add(self, track: Track, frame: int) -> None:
-        self.states[track.state] += 1
-        self.is_found = track.is_found
-        self.losses += self.last is TrackState.TRACKING and track.state is TrackState.LOST
-        self.last = track.state
-        if track.state is not TrackState.TRACKING:
-            return
-        if self.first_seen is None:
-            self.first_seen = frame
-        self.last_seen = frame
-        self.rmse_px.add(track.rmse_px)
-        self.matches.add(len(track.evidence))
-        self.inliers.add(track.evidence.inliers)
-        if track.model is not None:
-            self.models[track.model.value] += 1
-
-    def build(self) -> TargetSummary:
-        return TargetSummary(
-            self.name,
-            self.states[TrackState.TRACKING],
-            self.states[TrackState.LOST],
-            self.states[TrackState.SEARCHING],
-            self.losses,
-            self.first_seen,
-            self.rmse_px.value,
-            self.matches.value,
-            self.inliers.value,
-            dict(self.models.most_common()),
-            self.last_seen,
-            self.is_found,
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +110,7 @@ class Summary:
             "inliers": self.inliers,
             "models": self.models,
             "automatic_targets": self._auto_json(),
-            "targets": [_target_json(target) for target in self.targets],
+            "targets": [target.to_json() for target in self.targets],
             "ms_per_frame": {
                 "median": self.ms_median,
                 "p95": self.ms_p95,
@@ -299,24 +215,6 @@ class Summary:
         write_json(path, self.to_json())
 
 
-def _target_json(target: TargetSummary) -> dict[str, Any]:
-    return {
-        "name": target.name,
-        "frames_tracked": target.frames_tracked,
-        "frames_lost": target.frames_lost,
-        "frames_searching": target.frames_searching,
-        "share": target.share,
-        "first_seen": target.first_seen,
-        "last_seen": target.last_seen,
-        "automatic": target.is_found,
-        "losses": target.losses,
-        "rmse_px": target.rmse_px,
-        "matches": target.matches,
-        "inliers": target.inliers,
-        "models": target.models,
-    }
-
-
 class SummaryBuilder:
     """Running sums over Steps; memory does not grow with the number of frames.
 
@@ -338,7 +236,7 @@ class SummaryBuilder:
         self._camera = CameraNotes()
         self._features, self._inliers = Mean(), Mean()
         self._match_counts: Counter[int] = Counter()
-        self._targets: dict[str, _TargetSums] = {}
+        self._targets: dict[str, TargetSums] = {}
         self._auto_at_once: int | None = None
         self._auto_count = 0
         self._frames_at_level = [0] * len(LEVELS)
@@ -367,7 +265,7 @@ class SummaryBuilder:
 
     def _add_track(self, track: Track, frame: int) -> None:
         if track.name not in self._targets:
-            self._targets[track.name] = _TargetSums(track.name)
+            self._targets[track.name] = TargetSums(track.name)
             if track.is_found:
                 self._auto_count += 1
                 self._forget_found()

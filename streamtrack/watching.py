@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Protocol, TypeAlias
 from streamtrack.camera.moving import CameraEstimator
 from streamtrack.camera.notes import CameraNotes
 from streamtrack.errors import OutputError, StreamtrackError
+from streamtrack.mosaic.types import PlacedFrame
 from streamtrack.poses import FinalPoses, PosesWriter
 from streamtrack.results import GROUND_COLUMNS, TRACK_COLUMNS, open_tracks_writer
 from streamtrack.settings import Settings, WorldSettings
@@ -263,9 +264,11 @@ class MosaicWatcher:
         state = "placed" if not reason else "lost" if pose.world_from_frame is None else "refused"
         found = {"inliers": float(pose.inliers), "rmse_px": pose.rmse_px, "paint_ms": self.paint_ms}
         metrics = {name: value for name, value in found.items() if math.isfinite(value)}
+        placed = PlacedFrame(
+            frame.index, frame.time_s, frame.size_wh, state, world_from_frame, reason, metrics
+        )
         for display in self._displays:
-            place = (frame.index, frame.time_s, frame.size_wh, world_from_frame)
-            display.log_mosaic_frame(*place, state, reason, metrics)
+            display.log_mosaic_frame(placed)
             if display.is_mosaic_due(frame.time_s):
                 display.log_mosaic(self.mosaic.view(), frame.index, frame.time_s)
 

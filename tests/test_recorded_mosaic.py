@@ -17,6 +17,7 @@ from streamtrack.mosaic.types import (
     Link,
     MosaicView,
     Picture,
+    PlacedFrame,
     Placement,
     Status,
 )
@@ -84,15 +85,12 @@ def in_world(step, world, is_placed):
 def log_mosaic(recorder, index, view=None, is_placed=True, world=None):
     step = step_of(index, lost=range(30, 40))
     recorder.log(in_world(step, world or WorldMotion(), is_placed))
-    recorder.log_mosaic_frame(
-        index,
-        index / 25,
-        SIZE,
-        pose(index) if is_placed else None,
-        "placed" if is_placed else "lost",
-        "" if is_placed else "too few inliers",
-        {"keyframes": 2},
-    )
+    time_s, metrics = index / 25, {"keyframes": 2}
+    if is_placed:
+        placed = PlacedFrame(index, time_s, SIZE, "placed", pose(index), metrics=metrics)
+    else:
+        placed = PlacedFrame(index, time_s, SIZE, "lost", reason="too few inliers", metrics=metrics)
+    recorder.log_mosaic_frame(placed)
     recorder.log_mosaic(view or mosaic_view(), index, index / 25)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
@@ -122,3 +123,20 @@ class MosaicView:
     keyframe_outlines: Points
     edges: tuple[KeyframeEdge, ...] = field(default=())
     keyframes: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedFrame:
+    """What became of one frame of a stream on the mosaic.
+
+    ``state`` is ``placed``, ``refused`` or ``lost``, ``world_from_frame`` None unless placed;
+    ``metrics`` are figures of this frame by name, finite.
+    """
+
+    index: int
+    time_s: float
+    size_wh: Size
+    state: str
+    world_from_frame: Matrix | None = None
+    reason: str = ""
+    metrics: Mapping[str, float] = field(default_factory=dict)

@@ -24,7 +24,7 @@ import rerun_bindings
 from streamtrack.closing import Closing
 from streamtrack.errors import OutputError
 from streamtrack.geometry import inverted, scaling
-from streamtrack.mosaic.types import MosaicView
+from streamtrack.mosaic.types import MosaicView, PlacedFrame
 from streamtrack.recording import blueprint
 from streamtrack.recording.file import Layout, new_stream
 from streamtrack.recording.live_server import LiveAddress, LiveServer, ServerError, check_free
@@ -32,7 +32,7 @@ from streamtrack.recording.recorder import RunLogHandler, timeline_of
 from streamtrack.recording.steps import StepLog
 from streamtrack.recording.video import Clock, jpeg_video
 from streamtrack.settings import Settings
-from streamtrack.types import Image, Matrix, Size, SourceInfo, Step
+from streamtrack.types import Image, SourceInfo, Step
 from streamtrack.working_size import mapped_features, mapped_track, resized
 
 _log = logging.getLogger("streamtrack.live")
@@ -133,22 +133,10 @@ class LiveView(Closing):
 
         self._put(show)
 
-    def log_mosaic_frame(
-        self,
-        index: int,
-        time_s: float,
-        size_wh: Size,
-        world_from_frame: Matrix | None,
-        state: str,
-        reason: str = "",
-        metrics: Mapping[str, float] | None = None,
-    ) -> None:
+    def log_mosaic_frame(self, placed: PlacedFrame) -> None:
         """See `Recorder.log_mosaic_frame`."""
-        kept, pose = dict(metrics or {}), world_from_frame
-        if pose is not None:  # the targets are shown in pixels of the small picture
-            pose = pose @ inverted(scaling(self._factor))
-        small = (round(size_wh[0] * self._factor), round(size_wh[1] * self._factor))
-        self._put(lambda log: log.log_mosaic_frame(index, time_s, small, pose, state, reason, kept))
+        small = _scaled_place(placed, self._factor)
+        self._put(lambda log: log.log_mosaic_frame(small))
 
     def begin_close(self, summary_markdown: str = "") -> None:
         """Have the last things shown and the server end, without waiting for it."""
@@ -276,3 +264,13 @@ def _scaled_step(step: Step, factor: float) -> Step:
         ),
         features=None if features is None else mapped_features(features, small_from_full),
     )
+
+
+def _scaled_place(placed: PlacedFrame, factor: float) -> PlacedFrame:
+    """The place of the frame as if it had been given smaller, in the same world."""
+    pose = placed.world_from_frame
+    if pose is not None:
+        pose = pose @ inverted(scaling(factor))
+    width, height = placed.size_wh
+    small_wh = round(width * factor), round(height * factor)
+    return replace(placed, size_wh=small_wh, world_from_frame=pose)

@@ -7,7 +7,6 @@ lies at the origin.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -16,7 +15,7 @@ import numpy.typing as npt
 import rerun as rr
 
 from streamtrack.geometry import box_quad, inverted, scaling, transform_points, translation
-from streamtrack.mosaic.types import MosaicView
+from streamtrack.mosaic.types import MosaicView, PlacedFrame
 from streamtrack.recording import blueprint, rows
 from streamtrack.recording.blueprint import TargetEntities
 from streamtrack.recording.video import jpeg_of
@@ -77,8 +76,7 @@ class MosaicLog:
         self.follow(step)
         pose = step.camera.world_from_frame
         if pose is not None:
-            corners = box_quad(0, 0, step.frame.size_wh[0] - 1, step.frame.size_wh[1] - 1)
-            self._log_outline(transform_points(pose, corners))
+            self._log_outline(_outline(pose, step.frame.size_wh))
         else:
             self._log_strips(blueprint.MOSAIC_FRAME, np.zeros((0, 5, 2), np.float32))
         self._log_targets()
@@ -130,27 +128,19 @@ class MosaicLog:
             path = _thinned(target.place.path)
             self._log_strips(target.entities.mosaic_path, _mapped(preview_from_world, path[None]))
 
-    def log_frame(
-        self,
-        index: int,
-        size_wh: Size,
-        world_from_frame: Matrix | None,
-        state: str,
-        metrics: Mapping[str, float],
-    ) -> bool:
+    def log_frame(self, placed: PlacedFrame) -> bool:
         """Record where one frame came to lie; whether the state changed."""
         if self._preview_from_world is None and not self._state:
             self._log_styles()
-        has_changed, self._state = state != self._state, state
-        if state != self._shown_state:
-            self._shown_state = state
-            self._stream.log(blueprint.MOSAIC_STATE, rr.StateChange(state=state))
-        for name, value in metrics.items():
+        has_changed, self._state = placed.state != self._state, placed.state
+        if placed.state != self._shown_state:
+            self._shown_state = placed.state
+            self._stream.log(blueprint.MOSAIC_STATE, rr.StateChange(state=placed.state))
+        for name, value in placed.metrics.items():
             self._stream.log(self._curve_path(name), rows.scalar(value))
-        if world_from_frame is not None:
-            corners = box_quad(0, 0, size_wh[0] - 1, size_wh[1] - 1)
-            self._log_outline(transform_points(world_from_frame, corners))
-            if index == self._frame_index:
+        if placed.world_from_frame is not None:
+            self._log_outline(_outline(placed.world_from_frame, placed.size_wh))
+            if placed.index == self._frame_index:
                 self._log_targets()
         elif has_changed:
             self._log_strips(blueprint.MOSAIC_FRAME, np.zeros((0, 5, 2), np.float32))
@@ -229,6 +219,11 @@ def _thinned(path: Points) -> Points:
     """At most `_MAX_PATH` points of a path (N, 2), the last among them."""
     step = -(-len(path) // _MAX_PATH)
     return path[(len(path) - 1) % step :: step] if step > 1 else path
+
+
+def _outline(world_from_frame: Matrix, size_wh: Size) -> Points:
+    corners = box_quad(0, 0, size_wh[0] - 1, size_wh[1] - 1)
+    return transform_points(world_from_frame, corners)
 
 
 def _mapped(b_from_a: Matrix, lines: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

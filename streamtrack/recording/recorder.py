@@ -16,7 +16,7 @@ from pathlib import Path
 
 from streamtrack.closing import Closing
 from streamtrack.errors import OutputError
-from streamtrack.mosaic.types import MosaicView
+from streamtrack.mosaic.types import MosaicView, PlacedFrame
 from streamtrack.recording import blueprint
 from streamtrack.recording.file import RecordingFiles, free_bytes, new_stream, reserve_bytes
 from streamtrack.recording.repair import is_whole, mend
@@ -24,7 +24,7 @@ from streamtrack.recording.series import FileSeries, Limit, check_keep, parse_ke
 from streamtrack.recording.steps import StepLog
 from streamtrack.recording.video import Clock, open_video
 from streamtrack.settings import Settings
-from streamtrack.types import Image, Matrix, Size, SourceInfo, Step
+from streamtrack.types import Image, SourceInfo, Step
 from streamtrack.viewer import view
 
 __all__ = ["Recorder", "RunLogHandler", "timeline_of", "view"]
@@ -152,25 +152,11 @@ class Recorder(Closing):
                 self._steps.set_time(index, time_s)
                 self._steps.mosaic.log_view(view, time_s)
 
-    def log_mosaic_frame(
-        self,
-        index: int,
-        time_s: float,
-        size_wh: Size,
-        world_from_frame: Matrix | None,
-        state: str,
-        reason: str = "",
-        metrics: Mapping[str, float] | None = None,
-    ) -> None:
-        """Record where a frame came to lie on the mosaic, after its `log`.
-
-        ``state`` is ``placed``, ``refused`` or ``lost``, ``world_from_frame`` None unless placed.
-        """
+    def log_mosaic_frame(self, placed: PlacedFrame) -> None:
+        """Record where a frame came to lie on the mosaic, after its `log`."""
         if self.is_recording:
             with self._lock:
-                self._steps.log_mosaic_frame(
-                    index, time_s, size_wh, world_from_frame, state, reason, metrics or {}
-                )
+                self._steps.log_mosaic_frame(placed)
 
     def close(self, summary_markdown: str = "") -> None:
         """End the file; closing again does nothing."""

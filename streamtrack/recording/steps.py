@@ -17,6 +17,7 @@ import numpy.typing as npt
 import rerun as rr
 
 from streamtrack.errors import OutputError
+from streamtrack.mosaic.types import PlacedFrame
 from streamtrack.recording import blueprint, rows
 from streamtrack.recording.found import FoundLog
 from streamtrack.recording.mosaic import MosaicLog
@@ -29,8 +30,6 @@ from streamtrack.types import (
     Frame,
     Image,
     Mask,
-    Matrix,
-    Size,
     SourceInfo,
     Step,
     Track,
@@ -163,22 +162,13 @@ class StepLog:
                 self._counts[name] = count
                 self._stream.log(path, rows.scalar(count))
 
-    def log_mosaic_frame(
-        self,
-        index: int,
-        time_s: float,
-        size_wh: Size,
-        world_from_frame: Matrix | None,
-        state: str,
-        reason: str,
-        metrics: Mapping[str, float],
-    ) -> None:
+    def log_mosaic_frame(self, placed: PlacedFrame) -> None:
         """Where a frame came to lie on the mosaic; a change of state is a line in the log."""
-        self._clock.set(index, time_s)
-        if self._mosaic.log_frame(index, size_wh, world_from_frame, state, metrics):
-            level = "WARN" if state == "lost" else "INFO"
-            why = f": {reason}" if reason else ""
-            self.log_line(level, f"frame {index}: mosaic {state}{why}")
+        self._clock.set(placed.index, placed.time_s)
+        if self._mosaic.log_frame(placed):
+            level = "WARN" if placed.state == "lost" else "INFO"
+            why = f": {placed.reason}" if placed.reason else ""
+            self.log_line(level, f"frame {placed.index}: mosaic {placed.state}{why}")
 
     @property
     def mosaic(self) -> MosaicLog:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import platform
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -14,6 +11,7 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from streamtrack.bench.environment import environment
 from streamtrack.bench.mosaic_measure import (
     AUC_PX,
     RECALL_WITHIN_PX,
@@ -29,7 +27,6 @@ from streamtrack.settings import DESCRIPTORS
 
 Report = dict[str, Any]
 _WIDTH = 120
-_PACKAGES = ("streamtrack", "numpy", "opencv-contrib-python-headless")
 _GROUPS = {"synthetic": "Rendered pairs, exact truth", "folder": "Pairs of the folder"}
 _LEGEND = (
     "AUC@n: area under the recall curve of the mean corner error up to n px, in %, failures "
@@ -51,16 +48,7 @@ def build_pair_report(
         "benchmark": "mosaic",
         "options": options,
         "is_whole": run.is_whole,
-        "versions": {
-            "python": platform.python_version(),
-            **{package: version(package) for package in _PACKAGES},
-        },
-        "machine": {
-            "system": platform.system(),
-            "architecture": platform.machine(),
-            "cores": os.cpu_count(),
-            "opencv_threads": 1,
-        },
+        **environment(),
         "definitions": {
             "auc_px": list(AUC_PX),
             "wrong_above_visible_error_px": WRONG_ABOVE_PX,

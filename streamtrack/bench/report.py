@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import platform
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
+from streamtrack.bench.environment import environment
 from streamtrack.bench.measure import Footage, Run, Trial
 from streamtrack.bench.methods import Method
 from streamtrack.bench.scenarios import ABSENT_BELOW, MIN_VISIBLE
@@ -24,7 +22,6 @@ from streamtrack.bench.score import (
 from streamtrack.types import Size
 
 Report = dict[str, Any]
-_PACKAGES = ("streamtrack", "numpy", "opencv-contrib-python-headless", "av")
 
 
 def build_report(run: Run, methods: Sequence[Method], options: dict[str, Any]) -> Report:
@@ -33,16 +30,7 @@ def build_report(run: Run, methods: Sequence[Method], options: dict[str, Any]) -
         "benchmark": "track",
         "options": options,
         "is_whole": run.is_whole,
-        "versions": {
-            "python": platform.python_version(),
-            **{package: version(package) for package in _PACKAGES},
-        },
-        "machine": {
-            "system": platform.system(),
-            "architecture": platform.machine(),
-            "cores": os.cpu_count(),
-            "opencv_threads": 1,
-        },
+        **environment(),
         "definitions": {
             "precision_px": list(THRESHOLDS_PX),
             "scored_from_visible_share": MIN_VISIBLE,

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import logging
 from contextlib import suppress
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
-from typing import Self, cast
+from typing import cast
 
 import av
 import cv2
@@ -17,10 +15,9 @@ from av.container import OutputContainer
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
+from streamtrack.closing import Closing
 from streamtrack.errors import OutputError, UsageError
 from streamtrack.types import Image, Size
-
-_log = logging.getLogger("streamtrack.sources")
 
 _TICKS_HZ = 90_000
 
@@ -49,7 +46,7 @@ _FFV1 = _Coding("ffv1", "bgr0", {"level": "3", "slices": "4"}, needs_even_size=F
 _CODINGS = {".mp4": _H264, ".mov": _H264, ".mkv": _H264, ".webm": _VP9, ".avi": _MJPEG}
 
 
-class VideoWriter:
+class VideoWriter(Closing):
     """Encodes pictures with their times into a file whose ending names the format.
 
     ``.mp4``, ``.mov`` and ``.mkv`` are H.264 (x264) without B-frames, ``.webm`` is VP9 and
@@ -83,22 +80,6 @@ class VideoWriter:
             raise self._error(error) from None
         if self._path.is_dir():
             raise OutputError(f"cannot write {self._path}: it is a folder: give a file name")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        try:
-            self.close()
-        except OutputError as error:
-            if exc is None:
-                raise
-            _log.warning("%s", error)  # The first failure tells more than its consequence.
 
     def write(self, image: Image, time_s: float) -> None:
         """Append a picture (H, W, 3) BGR or (H, W) grey, shown at ``time_s``.

@@ -42,8 +42,8 @@ if TYPE_CHECKING:
         Track,
         TrackState,
         Verdict,
+        WorldPlace,
     )
-    from streamtrack.world import WorldPlace
 
 __all__ = [
     "AutoTarget",
@@ -91,7 +91,6 @@ _HOMES = {
     "streamtrack.sources": ("open_source",),
     "streamtrack.sources.base": ("FrameSource",),
     "streamtrack.targets": ("AutoTarget", "Target", "parse_targets"),
-    "streamtrack.world": ("WorldPlace",),
 }
 
 

@@ -23,7 +23,7 @@ from streamtrack.settings import StabilizeSettings
 from streamtrack.types import Image, Matrix, Points, Size, Step
 
 if TYPE_CHECKING:
-    from streamtrack.mosaic.stream.growing import PoseGraph
+    from streamtrack.pose_graph import PoseGraph
 
 _CROP = 0.06
 """Share of the picture's sides that is given up on each side, to have room to move in."""

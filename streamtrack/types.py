@@ -18,13 +18,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-
-if TYPE_CHECKING:
-    from streamtrack.world import WorldPlace
 
 Image: TypeAlias = npt.NDArray[np.uint8]
 Points: TypeAlias = npt.NDArray[np.float32]
@@ -271,6 +268,50 @@ class Evidence:
     @property
     def inliers(self) -> int:
         return int(np.count_nonzero(self.is_inlier))
+
+
+class _Path(Protocol):
+    """The positions of one target."""
+
+    def points(self, last_frame: int) -> Points:
+        """Those up to a frame, float32 (N, 2), where they lie by what is known now."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroundPlace:
+    """A target on the ground: ``position`` (2,), and its speed, None if unknown, in units."""
+
+    position: npt.NDArray[np.float64]
+    speed_units_s: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WorldPlace:
+    """Where a target is in the world, the pixel frame of the first keyframe.
+
+    quad           float32 (4, 2), the corners in world pixels
+    position       float64 (2,), where its diagonals cross
+    velocity_px_s  float64 (2,), over the last half second (`mean_velocity`), None before frame 3
+    ground         its place in units, None without a scale or beyond the horizon
+    """
+
+    quad: Points
+    position: npt.NDArray[np.float64]
+    velocity_px_s: npt.NDArray[np.float64] | None
+    ground: GroundPlace | None
+    _path: _Path
+    _frame: int
+
+    @property
+    def speed_px_s(self) -> float | None:
+        """World pixels a second."""
+        velocity = self.velocity_px_s
+        return None if velocity is None else float(np.hypot(*velocity))
+
+    @property
+    def path(self) -> Points:
+        """Its positions up to this frame, float32 (N, 2), oldest first, by today's poses."""
+        return self._path.points(self._frame)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -29,7 +29,8 @@ from streamtrack.working_size import graph_in_full_size
 
 if TYPE_CHECKING:
     from streamtrack.mosaic.stream.export import Exported
-    from streamtrack.mosaic.stream.growing import PoseGraph, StreamMosaic
+    from streamtrack.mosaic.stream.growing import StreamMosaic
+    from streamtrack.pose_graph import PoseGraph
     from streamtrack.recording.live_server import LiveAddress
     from streamtrack.recording.live_view import LiveView
     from streamtrack.recording.recorder import Recorder

@@ -20,8 +20,7 @@ from streamtrack.targets import MIN_SIDE_PX, Target, check_quad_in_picture, leas
 from streamtrack.types import CameraPose, Features, Frame, Image, Matrix, Size, Step, Track
 
 if TYPE_CHECKING:
-    from streamtrack.mosaic.stream.growing import PoseGraph
-    from streamtrack.mosaic.types import KeyframeEdge
+    from streamtrack.pose_graph import KeyframeEdge, PoseGraph
 
 
 def size_at(size_wh: Size, max_width: int | None) -> Size:

@@ -8,7 +8,7 @@ then move with them, so that a path stays whole and no speed jumps.
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -17,10 +17,10 @@ import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.ground import Ground
-from streamtrack.types import Frame, Matrix, Points, Step, Track
+from streamtrack.types import Frame, GroundPlace, Matrix, Points, Step, Track, WorldPlace
 
 if TYPE_CHECKING:
-    from streamtrack.mosaic.stream.growing import PoseGraph
+    from streamtrack.pose_graph import PoseGraph
 
 _WINDOW_S = 0.5
 """Velocities are means over this time."""
@@ -31,43 +31,6 @@ _MOST_IN_WINDOW = 24
 _MOST_POINTS = 4096
 
 Doubles = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GroundPlace:
-    """A target on the ground: ``position`` (2,), and its speed, None if unknown, in units."""
-
-    position: Doubles
-    speed_units_s: float | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class WorldPlace:
-    """Where a target is in the world, the pixel frame of the first keyframe.
-
-    quad           float32 (4, 2), the corners in world pixels
-    position       float64 (2,), where its diagonals cross
-    velocity_px_s  float64 (2,), over the last half second (`mean_velocity`), None before frame 3
-    ground         its place in units, None without a scale or beyond the horizon
-    """
-
-    quad: Points
-    position: Doubles
-    velocity_px_s: Doubles | None
-    ground: GroundPlace | None
-    _path: WorldPath
-    _frame: int
-
-    @property
-    def speed_px_s(self) -> float | None:
-        """World pixels a second."""
-        velocity = self.velocity_px_s
-        return None if velocity is None else float(np.hypot(*velocity))
-
-    @property
-    def path(self) -> Points:
-        """Its positions up to this frame, float32 (N, 2), oldest first, by today's poses."""
-        return self._path.points(self._frame)
 
 
 class WorldPath:

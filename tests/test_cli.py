@@ -277,7 +277,7 @@ def test_a_ctrl_c_that_nobody_catches_is_one_line(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("streamtrack.mosaic.job.run_mosaic", interrupted)
+    monkeypatch.setattr("streamtrack.mosaic.running.run_mosaic", interrupted)
     assert run("mosaic", "a.png", "b.png", "-o", "m.png") == 1
     assert capsys.readouterr().err == "streamtrack: error: interrupted\n"
 

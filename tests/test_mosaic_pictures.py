@@ -22,9 +22,9 @@ from streamtrack.mosaic.job import (
     MosaicOutcome,
     MosaicOutputs,
     NoMosaicProgress,
-    run_mosaic,
 )
 from streamtrack.mosaic.pictures.rotation import camera_matrix
+from streamtrack.mosaic.running import run_mosaic
 from streamtrack.mosaic.types import Status
 from streamtrack.settings import build_settings
 from streamtrack.types import Image, Matrix, Size

@@ -13,7 +13,6 @@ from test_recording import BLOB, SIZE, blob, picture, source, step_of, tracked
 from streamtrack.errors import OutputError
 from streamtrack.geometry import box_quad, scaling, transform_points, translation
 from streamtrack.mosaic.types import (
-    KeyframeEdge,
     Link,
     MosaicView,
     Picture,
@@ -21,6 +20,7 @@ from streamtrack.mosaic.types import (
     Placement,
     Status,
 )
+from streamtrack.pose_graph import KeyframeEdge
 from streamtrack.recording import pictures as recorded_pictures
 from streamtrack.recording.pictures import record_picture_mosaic
 from streamtrack.recording.recorder import Recorder

@@ -21,7 +21,8 @@ from streamtrack import geometry
 from streamtrack.camera.frame_poses import FramePose, FramePoses
 from streamtrack.errors import OutputError
 from streamtrack.mosaic.spill import Slot, SpillFile
-from streamtrack.mosaic.types import KeyframeEdge, Link
+from streamtrack.mosaic.types import Link
+from streamtrack.pose_graph import KeyframeEdge
 from streamtrack.types import Image, Matrix, Points, Size
 
 _JPEG_QUALITY = 92

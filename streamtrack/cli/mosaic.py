@@ -106,7 +106,8 @@ def mosaic(
         },
         {"max_fps": max_fps, "retries": retries},
     )
-    from streamtrack.mosaic.job import MosaicJob, MosaicOutputs, run_mosaic
+    from streamtrack.mosaic.job import MosaicJob, MosaicOutputs
+    from streamtrack.mosaic.running import run_mosaic
 
     address = None if live is None else _live_address(live, quiet)
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from streamtrack.errors import StreamtrackError, UsageError
+from streamtrack.errors import StreamtrackError
 from streamtrack.mosaic.summary import MosaicSummary
 from streamtrack.settings import Settings
 
@@ -72,23 +71,3 @@ class NoMosaicProgress:
 
     def advance(self, text: str = "") -> None:
         return None
-
-
-def run_mosaic(
-    job: MosaicJob, progress: MosaicProgress, should_stop: Callable[[], bool]
-) -> MosaicOutcome:
-    """Run the job, of pictures or of a stream; all outputs are closed when it returns.
-
-    Raises StreamtrackError if it cannot even start or an output cannot be written.
-    """
-    from streamtrack.mosaic.pictures.inputs import is_stream
-
-    if len(job.inputs) == 1 and is_stream(job.inputs[0]):
-        from streamtrack.mosaic.stream.job import run_stream_mosaic
-
-        return run_stream_mosaic(job, progress, should_stop)
-    if job.outputs.live is not None:
-        raise UsageError("--live shows a stream as it goes, and these are pictures: leave it out")
-    from streamtrack.mosaic.pictures.job import run_picture_mosaic
-
-    return run_picture_mosaic(job, progress, should_stop)

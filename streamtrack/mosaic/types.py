@@ -8,6 +8,7 @@ from enum import StrEnum
 from functools import cached_property
 
 from streamtrack import geometry
+from streamtrack.pose_graph import KeyframeEdge
 from streamtrack.pyramid import Pyramid
 from streamtrack.types import (
     Features,
@@ -95,17 +96,6 @@ class Placement:
     reason: str = ""
     world_from_picture: Matrix | None = None
     time_s: float = float("nan")
-
-
-@dataclass(frozen=True, slots=True)
-class KeyframeEdge:
-    """A verified link between keyframes ``a`` and ``b``; ``is_loop`` if it closed a loop."""
-
-    a: int
-    b: int
-    inliers: int
-    rmse_px: float
-    is_loop: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)

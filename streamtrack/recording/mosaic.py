@@ -20,8 +20,7 @@ from streamtrack.recording import blueprint, rows
 from streamtrack.recording.blueprint import TargetEntities
 from streamtrack.recording.video import jpeg_of
 from streamtrack.targets import color_number
-from streamtrack.types import Image, Matrix, Points, Size, Step
-from streamtrack.world import WorldPlace
+from streamtrack.types import Image, Matrix, Points, Size, Step, WorldPlace
 
 _IMAGE_EVERY_S = 1.0
 _SIDE, _MOST_ENLARGED = 768, 4.0

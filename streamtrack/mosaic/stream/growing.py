@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -31,7 +30,8 @@ from streamtrack.mosaic.stream.render import Renderer
 from streamtrack.mosaic.stream.rerender import Rerenderer
 from streamtrack.mosaic.stream.tiles import TILE, Box
 from streamtrack.mosaic.stream.views import View, ViewStore
-from streamtrack.mosaic.types import KeyframeEdge, MosaicView
+from streamtrack.mosaic.types import MosaicView
+from streamtrack.pose_graph import KeyframeEdge, PoseGraph
 from streamtrack.settings import MosaicSettings
 from streamtrack.types import CameraPose, Frame, Image, Matrix, Points, Track
 
@@ -50,38 +50,6 @@ _CHECKED_A_FRAME, _MOVED_A_FRAME = 64, 3
 _SAMPLES_TO_JUDGE = 3
 _LEAST_CONTESTED = 16
 _TILE_SHARE, _VIEW_SHARE, _CACHE_SHARE = 0.5, 0.2, 0.15
-
-
-class Keyframe(Protocol):
-    """What the mosaic shows of a keyframe."""
-
-    @property
-    def world_from_keyframe(self) -> Matrix: ...
-
-
-class PoseGraph(Protocol):
-    """Poses that may still change; `revision` counts the changes."""
-
-    @property
-    def revision(self) -> int: ...
-
-    @property
-    def keyframes(self) -> Mapping[int, Keyframe]: ...
-
-    @property
-    def edges(self) -> Iterable[KeyframeEdge]: ...
-
-    def world_from_frame(self, index: int) -> Matrix | None:
-        """The pose of a frame as it is known now."""
-        ...
-
-    def keep(self, index: int) -> None:
-        """A frame of which the pose will always be asked for."""
-        ...
-
-    def keyframe_of(self, index: int) -> int | None:
-        """The keyframe that a frame moves with; None if that is not known."""
-        ...
 
 
 @dataclass(slots=True)

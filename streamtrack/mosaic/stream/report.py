@@ -13,7 +13,8 @@ from streamtrack import geometry
 from streamtrack.meters import LogHistogram, peak_rss_mb
 from streamtrack.mosaic.stream.export import Exported
 from streamtrack.mosaic.summary import LinkSummary, MosaicSummary
-from streamtrack.mosaic.types import KeyframeEdge, Link, Placement, Status
+from streamtrack.mosaic.types import Link, Placement, Status
+from streamtrack.pose_graph import KeyframeEdge
 from streamtrack.settings import Settings
 from streamtrack.sources.base import FrameSource
 from streamtrack.sources.live_status import LiveStatus

@@ -27,6 +27,7 @@ from streamtrack.cli.common import (
     warnings_shown,
 )
 from streamtrack.errors import UsageError
+from streamtrack.sources.addresses import path_of
 
 
 def track(
@@ -34,6 +35,7 @@ def track(
         str,
         typer.Argument(
             metavar="SOURCE",
+            parser=path_of,
             help="Video file, folder or glob of pictures, /dev/videoN (see streamtrack devices), "
             "v4l2://, rtsp://, http(s)://, udp://, - for standard input, or "
             "synthetic://SCENE?seed=1&frames=300.",

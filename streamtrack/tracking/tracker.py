@@ -32,6 +32,7 @@ from streamtrack.tracking.appearance import (
     chroma_distance,
     prepare_colors,
 )
+from streamtrack.tracking.certainty import are_corners_certain
 from streamtrack.tracking.flatness import Flatness
 from streamtrack.tracking.flow import FlowAligner
 from streamtrack.tracking.prediction import Prediction
@@ -358,6 +359,11 @@ class HybridTracker:
         self._frames_lost = self._searches = 0
         self._was_seen = True
         evidence = Evidence(alignment.template_points, alignment.frame_points, found.is_inlier)
+        # It is followed all the same: what is seen of it leads to where more of it is seen.
+        if means != "view" and not are_corners_certain(
+            found.b_from_a, evidence, self.template.quad, self._settings.registration.model
+        ):
+            found = refused(Verdict.UNCERTAIN, len(evidence), found.is_inlier)
         return make_track(
             self.template, found, evidence, means, self._was_seen, alignment.correlation
         )

@@ -13,16 +13,15 @@ _MAX_SIGMA_SHARE = 0.02  # of the target's size in the frame, if that is more
 _LEAST_POINT_SIGMA_PX = 0.1
 
 
-def are_corners_certain(pose: Matrix, evidence: Evidence, quad: Points, model: str) -> bool:
+def are_corners_certain(pose: Matrix, model: Model, evidence: Evidence, quad: Points) -> bool:
     """Is ``pose`` (frame_from_template) good enough at the corners ``quad`` (4, 2) to be told?
 
     What motion lets expect of hidden corners is no evidence here: it is what goes wrong unnoticed.
-    ``model`` is the one asked for; ``auto`` counts as a homography, which a plane may always need.
     """
     seen = evidence.is_inlier
     sigmas_px = corner_sigmas_px(
         pose,
-        Model.HOMOGRAPHY if model == "auto" else Model(model),
+        model,
         evidence.template_points[seen],
         evidence.frame_points[seen],
         quad,

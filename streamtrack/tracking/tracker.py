@@ -361,12 +361,20 @@ class HybridTracker:
         evidence = Evidence(alignment.template_points, alignment.frame_points, found.is_inlier)
         # It is followed all the same: what is seen of it leads to where more of it is seen.
         if means != "view" and not are_corners_certain(
-            found.b_from_a, evidence, self.template.quad, self._settings.registration.model
+            found.b_from_a, self._richest_model, evidence, self.template.quad
         ):
             found = refused(Verdict.UNCERTAIN, len(evidence), found.is_inlier)
         return make_track(
             self.template, found, evidence, means, self._was_seen, alignment.correlation
         )
+
+    @property
+    def _richest_model(self) -> Model:
+        """The freedoms of the corners: few, as long as the target was not seen to be flat."""
+        wanted = self._settings.registration.model
+        if wanted != "auto":
+            return Model(wanted)
+        return Model.HOMOGRAPHY if self._flatness.is_proven else Model.AFFINE
 
 
 def _register_features(

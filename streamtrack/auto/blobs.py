@@ -56,13 +56,13 @@ class Scene:
     """What moves in one frame: the blobs, the pixels (h, w) they consist of, and the motion there.
 
     ``motion`` (h, w, 2) are grid pixels since the frame before, None if that is not known;
-    ``grey`` (h, w) is the frame in the grid.
+    ``image`` (h, w, 3) is the frame in the grid.
     """
 
     blobs: tuple[Blob, ...]
     solid: Mask
     motion: npt.NDArray[np.float32] | None
-    grey: Image
+    image: Image
     grid_from_frame: Doubles
 
 
@@ -108,7 +108,7 @@ def find_blobs(
                 solid[window] |= piece
                 blobs.append(_blob(piece, window, outstanding, motion))
     blobs = _with_fragments(blobs, frame_px(outstanding))
-    return Scene(tuple(blobs), solid, motion, outstanding.grey, outstanding.grid_from_frame)
+    return Scene(tuple(blobs), solid, motion, outstanding.image, outstanding.grid_from_frame)
 
 
 def _with_fragments(blobs: list[Blob], grid_px: float) -> list[Blob]:

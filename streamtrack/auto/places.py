@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import cv2
@@ -13,13 +14,22 @@ from streamtrack import geometry
 from streamtrack.auto.background import Outstanding
 from streamtrack.auto.blobs import Scene
 from streamtrack.frame_view import FrameView
-from streamtrack.types import Image, Mask, Matrix, Track
+from streamtrack.types import Image, Mask, Matrix, Size, Track
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
 _WIDTH_PX = 320
 REST_PX = 0.4  # grid pixels a frame, below which something stands
 _CHANGE_FACTOR = 4.0  # of the noise, by which a pixel differs from the frame before
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """Seconds since the frame before, frame pixels a grid pixel, and the frame's size."""
+
+    step_s: float
+    grid_px: float
+    size_wh: Size
 
 
 def reduced(view: FrameView) -> tuple[Image, Matrix]:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.auto.blobs import Blob, Scene
-from streamtrack.auto.boxes import box_around, overlaps
+from streamtrack.auto.boxes import box_around, overlap, overlaps
 from streamtrack.auto.followed import Followed, Life
 from streamtrack.auto.likeness import Likeness
 from streamtrack.auto.places import Moment, motion_within
@@ -27,6 +27,7 @@ _WHOLE = 0.85, 1.18  # size of what is found against its own, while it is seen w
 _CORE_SHARE = 0.75
 _ELDER_HITS = 10  # sightings of its own that make it a thing of its own
 _ALIKE_PX = 0.8  # grid pixels a frame, between motions of parts of one thing
+_DUPLICATE_OVERLAP = 0.75
 _MOST_GUESSED = 10  # frames that a hidden thing goes on as before
 
 
@@ -58,9 +59,9 @@ def sight(thing: Followed, scene: Scene, moment: Moment) -> bool:
 
 def carry(thing: Followed, scene: Scene, moment: Moment) -> bool:
     """Move a thing that was not sighted as the pixels in its place move; False if it is gone."""
-    if thing.touches and thing.likeness is not None and thing.guessed < _MOST_GUESSED:
+    if thing.touches and thing.likeness is not None:
         thing.guessed += 1
-        return True
+        return thing.guessed <= _MOST_GUESSED
     found = motion_within(scene, thing.box)
     if found is None or found[1] < CARRYING_SHARE:
         return False
@@ -72,6 +73,7 @@ def portray(thing: Followed, blob: Blob, scene: Scene) -> None:
     """Keep a picture of a thing that is seen alone and whole."""
     if thing.touches or thing.life is not Life.SEEN or not is_whole(thing, blob):
         return
+    thing.alone += 1
     taken = Likeness.taken(scene.image, _core(thing, scene))
     thing.likeness = taken or thing.likeness
 
@@ -93,6 +95,14 @@ def own_things(things: Sequence[Followed], moment: Moment) -> list[Followed]:
         thing for thing in things if thing not in elders and not is_alike(thing, first, moment)
     ]
     return [*(elders or [first]), *(thing for thing in others if thing is not first)]
+
+
+def is_duplicate(younger: Followed, elder: Followed, moment: Moment) -> bool:
+    """Are two things one, or the one a part of the other? Never so if both were seen alone."""
+    common, inside = overlap(younger.box, elder.box)
+    if inside <= _DUPLICATE_OVERLAP or min(younger.alone, elder.alone) >= _ELDER_HITS:
+        return False
+    return common > _DUPLICATE_OVERLAP or is_alike(elder, younger, moment)
 
 
 def is_alike(one: Followed, other: Followed, moment: Moment) -> bool:

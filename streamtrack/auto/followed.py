@@ -62,6 +62,7 @@ class Followed(HasBox):
     ends: FreeEnds = field(default_factory=FreeEnds)
     likeness: Likeness | None = None
     touches: bool = False
+    alone: int = 0
     guessed: int = 0
     reason: str = ""
 

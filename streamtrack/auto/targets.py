@@ -22,7 +22,7 @@ from streamtrack.auto.boxes import overlap, touched_edges
 from streamtrack.auto.contact import (
     carry,
     hold_to_edges,
-    is_alike,
+    is_duplicate,
     is_whole,
     note_contacts,
     own_things,
@@ -66,7 +66,6 @@ _COAST_S = 2.0
 _SLOWER_AFTER_S = 0.5  # lost, until which it is thought to go on as fast
 _MOST_TARGETS = 60
 _BROKEN_FRAMES = 5  # in a row, after which the scene is another one
-_DUPLICATE_OVERLAP = 0.75
 _REACH_PX = 4.0  # grid pixels, beyond which nothing is found again
 _REST_FRAMES = 8
 _USUAL_STEP_S = 0.04
@@ -248,11 +247,7 @@ class AutoTargets:
         named.sort(key=lambda thing: -thing.hits)
         for index, thing in enumerate(named):
             for younger in named[index + 1 :]:
-                common, inside = overlap(younger.box, thing.box)
-                is_same = common > _DUPLICATE_OVERLAP or (
-                    inside > _DUPLICATE_OVERLAP and is_alike(thing, younger, moment)
-                )
-                if is_same:
+                if is_duplicate(younger, thing, moment):
                     younger.life = Life.OVER
         self._things = [thing for thing in self._things if thing.life is not Life.OVER]
 

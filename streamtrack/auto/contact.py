@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.auto.blobs import Blob, Scene
-from streamtrack.auto.boxes import box_around, overlap, overlaps
+from streamtrack.auto.boxes import box_around, overlaps
 from streamtrack.auto.followed import Followed, Life
 from streamtrack.auto.likeness import Likeness
 from streamtrack.auto.places import Moment, motion_within
@@ -28,6 +28,7 @@ _CORE_SHARE = 0.75
 _ELDER_HITS = 10  # sightings of its own that make it a thing of its own
 _ALIKE_PX = 0.8  # grid pixels a frame, between motions of parts of one thing
 _DUPLICATE_OVERLAP = 0.75
+_PORTRAIT_FRAMES = 3  # between two pictures of a thing
 _MOST_GUESSED = 10  # frames that a hidden thing goes on as before
 
 
@@ -74,6 +75,8 @@ def portray(thing: Followed, blob: Blob, scene: Scene) -> None:
     if thing.touches or thing.life is not Life.SEEN or not is_whole(thing, blob):
         return
     thing.alone += 1
+    if thing.likeness is not None and thing.alone % _PORTRAIT_FRAMES:
+        return
     taken = Likeness.taken(scene.image, _core(thing, scene))
     thing.likeness = taken or thing.likeness
 
@@ -89,7 +92,7 @@ def own_things(things: Sequence[Followed], moment: Moment) -> list[Followed]:
 
     Fragments were hardly ever seen alone, and move as the rest does.
     """
-    elders = [thing for thing in things if thing.hits >= _ELDER_HITS]
+    elders = [thing for thing in things if thing.alone >= _ELDER_HITS]
     first = max(things, key=lambda thing: thing.hits)
     others = [
         thing for thing in things if thing not in elders and not is_alike(thing, first, moment)
@@ -97,12 +100,23 @@ def own_things(things: Sequence[Followed], moment: Moment) -> list[Followed]:
     return [*(elders or [first]), *(thing for thing in others if thing is not first)]
 
 
-def is_duplicate(younger: Followed, elder: Followed, moment: Moment) -> bool:
-    """Are two things one, or the one a part of the other? Never so if both were seen alone."""
-    common, inside = overlap(younger.box, elder.box)
-    if inside <= _DUPLICATE_OVERLAP or min(younger.alone, elder.alone) >= _ELDER_HITS:
-        return False
-    return common > _DUPLICATE_OVERLAP or is_alike(elder, younger, moment)
+def end_duplicates(things: Sequence[Followed], moment: Moment) -> None:
+    """Of two things at one place, moving alike, the one that was seen for longer is right.
+
+    Two that were each seen alone are two.
+    """
+    named = [thing for thing in things if thing.life in (Life.SEEN, Life.CARRIED)]
+    if len(named) < 2:
+        return
+    named.sort(key=lambda thing: -thing.hits)
+    boxes = np.stack([thing.box for thing in named])
+    common, inside = overlaps(boxes, boxes)
+    for row, column in np.argwhere(np.tril(inside > _DUPLICATE_OVERLAP, -1)).tolist():
+        younger, elder = named[row], named[column]
+        if elder.life is Life.OVER or min(younger.alone, elder.alone) >= _ELDER_HITS:
+            continue
+        if common[row, column] > _DUPLICATE_OVERLAP or is_alike(elder, younger, moment):
+            younger.life = Life.OVER
 
 
 def is_alike(one: Followed, other: Followed, moment: Moment) -> bool:

@@ -40,7 +40,7 @@ class Likeness:
         picture = image[low[1] : high[1] + 1, low[0] : high[0] + 1]
         if (
             min(picture.shape[:2]) < _LEAST_SIDE_PX
-            or float(picture.std(axis=(0, 1)).max()) < _LEAST_CONTRAST
+            or float(cv2.meanStdDev(picture)[1].max()) < _LEAST_CONTRAST
         ):
             return None
         return cls(picture.copy(), grid_box[:2] - low)

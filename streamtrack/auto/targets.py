@@ -15,14 +15,14 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.auto.association import associate
+from streamtrack.auto.association import associate, found_again
 from streamtrack.auto.background import BackgroundModel, Outstanding
 from streamtrack.auto.blobs import Blob, MotionField, Scene, find_blobs, frame_px
 from streamtrack.auto.boxes import overlap, touched_edges
 from streamtrack.auto.contact import (
     carry,
+    end_duplicates,
     hold_to_edges,
-    is_duplicate,
     is_whole,
     note_contacts,
     own_things,
@@ -33,7 +33,7 @@ from streamtrack.auto.followed import Followed, Life
 from streamtrack.auto.places import (
     REST_PX,
     Moment,
-    fill,
+    filled,
     hidden_by,
     is_invertible,
     moving_pixels,
@@ -129,7 +129,7 @@ class AutoTargets:
         self._associate(scene, moment)
         self._background.learn(seen, moving, self._protected(seen))
         self._confirm(self._background, scene, moment)
-        self._drop_duplicates(moment)
+        end_duplicates(self._things, moment)
         self._end_left_places(self._background, scene, moment)
         return self._tracks()
 
@@ -231,8 +231,15 @@ class AutoTargets:
                 continue
             if _end_left_place(thing, background, scene):
                 continue
-            thing.life, thing.name, named = Life.SEEN, self._next_name(), named + 1
-            thing.home = thing.box.copy()
+            before = found_again(thing, self._things, _REACH_PX * moment.grid_px)
+            if before is not None:
+                before.life = Life.OVER
+                thing.name, thing.home = before.name, before.home
+            else:
+                thing.name, thing.home = self._next_name(), thing.box.copy()
+                named += 1
+            thing.life = Life.SEEN
+        self._things = [thing for thing in self._things if thing.life is not Life.OVER]
 
     def _next_name(self) -> str:
         while True:
@@ -241,23 +248,10 @@ class AutoTargets:
             if name not in self._taken:
                 return name
 
-    def _drop_duplicates(self, moment: Moment) -> None:
-        """Of two things at one place, moving alike, the one that was seen for longer is right."""
-        named = [thing for thing in self._things if thing.life in (Life.SEEN, Life.CARRIED)]
-        named.sort(key=lambda thing: -thing.hits)
-        for index, thing in enumerate(named):
-            for younger in named[index + 1 :]:
-                if is_duplicate(younger, thing, moment):
-                    younger.life = Life.OVER
-        self._things = [thing for thing in self._things if thing.life is not Life.OVER]
-
     def _protected(self, seen: Outstanding) -> Mask:
         """Where targets are: there the background learns nothing."""
-        mask = np.zeros(seen.clear.shape, np.uint8)
-        for thing in self._things:
-            if thing.life in (Life.SEEN, Life.CARRIED):
-                fill(mask, thing.quad, seen.grid_from_frame, 1)
-        return mask > 0
+        there = [t.quad for t in self._things if t.life in (Life.SEEN, Life.CARRIED)]
+        return filled(there, seen.grid_from_frame, seen.clear.shape)
 
     def _blind(self, reason: str) -> list[Track]:
         """A frame in which nothing can be seen: the targets are lost, or end."""
@@ -313,9 +307,7 @@ class AutoTargets:
 
 def _end_left_place(thing: Followed, background: BackgroundModel, scene: Scene) -> bool:
     """End a thing if it only marks the place that something left, and heal the background."""
-    place = np.zeros(scene.solid.shape, np.uint8)
-    fill(place, thing.quad, scene.grid_from_frame, 1)
-    there = (place > 0) & scene.solid
+    there = filled([thing.quad], scene.grid_from_frame, scene.solid.shape) & scene.solid
     if not background.has_left(there):
         return False
     background.heal(there)

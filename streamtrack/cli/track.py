@@ -56,8 +56,11 @@ def track(
         float | None,
         typer.Option(
             metavar="MS",
-            help="Keep the time a frame near MS by doing less, in four stated levels; of a live "
-            "source from when the frame lay ready. Results then depend on the machine's speed.",
+            help="Keep the time a frame near MS by doing less, in four levels: all; half the area "
+            "and features; a third of the features, lost targets searched for in every second "
+            "frame; a quarter, every fourth. Of a live source it counts from when the frame lay "
+            "ready. The summary says how often it was exceeded. Results then depend on the "
+            "machine's speed.",
         ),
     ] = None,
     camera: Annotated[

@@ -107,7 +107,10 @@ _ALL = (
     Method("kcf", "KCF, box", peers.kcf, {"parameters": "OpenCV's defaults"}, is_box=True),
 )
 METHODS: Mapping[str, Method] = {method.name: method for method in _ALL}
-QUICK_METHODS = ("streamtrack", "plane-tracker", "lk-chain", "prewarp-lk")
+QUICK_METHODS = (
+    *("streamtrack", "harris-freak", "plane-tracker"),
+    *("lk-chain", "prewarp-lk", "prewarp-dis"),
+)
 
 
 def choose_methods(names: Sequence[str]) -> list[Method]:

@@ -1,9 +1,9 @@
 """The benchmark's sequences: pictures with the target's true corners in each.
 
-Synthetic ones run over scenes and seeds, one seed unless more are asked for. Of the seeds of a
-scene about every fourth sequence is 1280x720, the others 640x480, and every second shows a
-photograph where scikit-image is installed (only what lies in its package; nothing is fetched), the
-others a painted texture. A sequence is held in memory as a whole.
+Synthetic ones run over scenes and seeds. Of the seeds of a scene about every fourth sequence is
+1280x720, the others 640x480, and every second shows a photograph where scikit-image is installed
+(only what lies in its package; nothing is fetched), the others a painted texture. A sequence is
+held in memory as a whole.
 
 Scored are frames with at least a fifth of the target visible, except the first, in which it is
 given; POT sequences as POT says: annotated, flag 0, and not the first annotated one.
@@ -41,22 +41,19 @@ _PHOTOS = (
     *("astronaut.png", "chelsea.png", "coffee.png", "camera.png"),
     *("rocket.jpg", "motorcycle_left.png"),
 )
-FRAMES = {
-    **dict.fromkeys(SCENES, 60),
-    **dict.fromkeys(("occlusion", "outofview", "unconstrained", "absence"), 150),
-    "fullocclusion": 120,
-}
+FRAMES = 150
 """Enough for every scene to show what it is made for: in ``absence`` the target is back at 130."""
 QUICK_FRAMES = {
-    "scale": 40,
-    "perspective": 40,
-    "blur": 30,
-    "unconstrained": 75,
+    "scale": 60,
+    "perspective": 50,
+    "blur": 40,
+    "unconstrained": 90,
     "absence": 135,
-    "weak": 25,
-    "small": 25,
-    "fast": 25,
-    "static": 25,
+    "fullocclusion": 105,
+    "weak": 40,
+    "small": 40,
+    "fast": 40,
+    "static": 30,
 }
 MIN_VISIBLE = 0.2
 ABSENT_BELOW = 0.02
@@ -207,11 +204,11 @@ def synthetic_scenarios(
     for scene in chosen:
         if scene not in SCENES:
             raise unknown_name("scene", scene, SCENES)
-    usual = {**FRAMES, **QUICK_FRAMES} if is_quick else FRAMES
+    usual = QUICK_FRAMES if is_quick else {}
     result: list[Scenario] = []
     for scene in dict.fromkeys(chosen):
         for seed in dict.fromkeys(seeds):
-            count = frames or usual[scene]
+            count = frames or usual.get(scene, FRAMES)
             size = (640, 480) if is_quick else _size(scene, seed)
             result.append(SyntheticScenario(scene, seed, size, count, _photo(scene, seed)))
     return result

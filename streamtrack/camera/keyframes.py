@@ -191,6 +191,12 @@ class KeyframeGraph:
         """Remember where a frame lies against a keyframe."""
         self._frames.add(index, FramePose(keyframe, keyframe_from_frame))
 
+    def hide(self, index: int, hidden: tuple[Points, ...]) -> None:
+        """Say what of a keyframe does not belong to the scene."""
+        with self._lock:
+            keyframe = replace(self._keyframes[index], hidden=hidden)
+            self._keyframes = {**self._keyframes, index: keyframe}
+
     def add_link(self, link: Link, is_loop: bool) -> None:
         """Join two keyframes. The link's ``a`` and ``b`` are indices of keyframes."""
         edge = KeyframeEdge(link.a, link.b, link.registration.inliers, link.rmse_px, is_loop)

@@ -18,6 +18,7 @@ import numpy as np
 from streamtrack import geometry
 from streamtrack.camera.keyframe_links import LevelCache, NewKeyframe, link_of, overlapping
 from streamtrack.camera.keyframes import KeyframeGraph
+from streamtrack.camera.layers import Doubts, separated
 from streamtrack.camera.loops import LoopCloser
 from streamtrack.camera.relocalising import Relocaliser
 from streamtrack.camera.shear import ShearWatch
@@ -35,6 +36,7 @@ _MIN_OVERLAP_UNSHARP = 0.45  # below which a blurred frame, too, becomes a keyfr
 _MIN_SHARPNESS = 0.75
 _MIN_AGREEING_CELLS = 30
 _MIN_LASTING_SHARE = 0.5  # of agreeing cells; below it the scene itself has changed
+_MAX_LASTING_SIGMA_PX = 1.0  # of the corners; above it a keyframe holds too little of a frame
 _MIN_SPACING = 3  # frames between keyframes that are taken for that alone
 _MIN_REUSED_OVERLAP = 0.8
 _MIN_TEXTURED_CELLS = 12
@@ -68,12 +70,13 @@ class CameraEstimator(Protocol):
 class _State:
     """Where the camera was last known to be.
 
-    ``step`` is the motion (last frame from next, a similarity) in ``step_s`` seconds, None if it
-    is not known.
+    ``levels`` is what it saw there. ``step`` is the motion (last frame from next, a similarity) in
+    ``step_s`` seconds, None if it is not known.
     """
 
     keyframe: int
     keyframe_from_frame: Matrix
+    levels: ViewLevels
     time_s: float
     step: Matrix | None
     step_s: float
@@ -101,6 +104,7 @@ class MovingCamera:
         self._relocaliser = Relocaliser(self.graph, settings)
         self._references: dict[int, ReferenceView] = {}
         self._shear = ShearWatch()
+        self._doubts = Doubts()
         self._state: _State | None = None
 
     def update(self, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
@@ -120,6 +124,9 @@ class MovingCamera:
             if recognised is None:
                 return _refused(found)
             keyframe, found = recognised
+        found = self._background(keyframe, levels, hidden, found)
+        if found.reference_from_view is None:
+            return _refused(found)
         self._relocaliser.rest()
         return self._placed(view, levels, hidden, keyframe, found)
 
@@ -134,7 +141,7 @@ class MovingCamera:
             return CameraPose(None, reason=str(Verdict.TOO_FEW_FEATURES))
         self._take(view, reference, np.eye(3), None)
         self._shear.begin(view.frame.index)
-        self._state = _State(view.frame.index, np.eye(3), view.frame.time_s, None, 0.0)
+        self._state = _State(view.frame.index, np.eye(3), levels, view.frame.time_s, None, 0.0)
         return CameraPose(np.eye(3), cells, cells, 0.0, keyframe=view.frame.index, is_keyframe=True)
 
     def _follow(
@@ -165,6 +172,23 @@ class MovingCamera:
                 return keyframe, found
         return None
 
+    def _background(
+        self, keyframe: int, levels: ViewLevels, hidden: Sequence[Points], found: ViewAlignment
+    ) -> ViewAlignment:
+        """The alignment of what lies behind, where the one found has doubtful support.
+
+        What moves before it is left out of the keyframe from then on.
+        """
+        if not self._doubts.are_due(keyframe, found):
+            return found
+        reference = self._reference(keyframe)
+        layers = separated(reference, levels, found, hidden)
+        if layers.foreground:
+            outlines = (*reference.hidden, *layers.foreground)
+            self.graph.hide(keyframe, outlines)
+            self._keep_reference(keyframe, ReferenceView(reference.levels, outlines))
+        return layers.background
+
     def _placed(
         self,
         view: FrameView,
@@ -181,6 +205,7 @@ class MovingCamera:
         world_from_frame = geometry.normalized(world_from_keyframe @ keyframe_from_frame)
         if self._shear.is_sheared(keyframe, found, view.size_wh):
             return CameraPose(None, matches, found.inliers, found.rmse_px, str(Verdict.SHEARED))
+        before = self._state
         self._remember(view, keyframe, keyframe_from_frame)
         if _stretch(world_from_frame, view.size_wh) > _MAX_STRETCH:
             return CameraPose(None, matches, found.inliers, found.rmse_px, str(Verdict.STRETCHED))
@@ -190,7 +215,7 @@ class MovingCamera:
             other = self._better_keyframe(view, levels, hidden, keyframe, world_from_frame)
             if other is not None:
                 keyframe = other
-            elif self._extend(view, levels, hidden, keyframe, found):
+            elif self._extend(view, before, hidden, keyframe, found):
                 keyframe, is_keyframe = index, True
             moved = self.graph.world_from_frame(index)
             world_from_frame = world_from_frame if moved is None else moved
@@ -211,18 +236,19 @@ class MovingCamera:
             quad = geometry.image_quad(view.size_wh)
             step = fit(Model.SIMILARITY, quad, geometry.transform_points(motion, quad))
             step_s = time_s - state.time_s
-        self._state = _State(keyframe, keyframe_from_frame, time_s, step, step_s)
+        self._state = _State(keyframe, keyframe_from_frame, view.levels, time_s, step, step_s)
 
     def _go_over(self, keyframe: int, keyframe_from_frame: Matrix) -> None:
         """Go on from another keyframe; the motion from frame to frame stays."""
         state = self._state
         assert state is not None
-        self._state = _State(keyframe, keyframe_from_frame, state.time_s, state.step, state.step_s)
+        self._state = replace(state, keyframe=keyframe, keyframe_from_frame=keyframe_from_frame)
 
     def _has_moved_on(self, found: ViewAlignment, view: FrameView, keyframe: int) -> bool:
         if _overlap(found, view.size_wh) < _MIN_OVERLAP or found.inliers < _MIN_AGREEING_CELLS:
             return True
         has_changed = found.inliers < _MIN_LASTING_SHARE * len(found.is_inlier)
+        has_changed |= found.corner_sigma_px > _MAX_LASTING_SIGMA_PX
         return has_changed and view.frame.index >= keyframe + _MIN_SPACING
 
     def _may_be_keyframe(self, found: ViewAlignment, size_wh: Size) -> bool:
@@ -254,7 +280,7 @@ class MovingCamera:
     def _extend(
         self,
         view: FrameView,
-        levels: ViewLevels,
+        before: _State | None,
         hidden: Sequence[Points],
         keyframe: int,
         found: ViewAlignment,
@@ -267,13 +293,13 @@ class MovingCamera:
             return False
         assert found.reference_from_view is not None
         index = view.frame.index
-        reference = ReferenceView(levels, hidden)
+        reference = self._new_reference(view.levels, before, hidden, keyframe, found)
         keyframe_from_frame, link = found.reference_from_view, link_of(index, keyframe, found)
         is_sure = found.inliers >= _MIN_AGREEING_CELLS
         if not is_sure:
             guess = geometry.inverted(found.reference_from_view)
-            before = self.graph.keyframes[keyframe].hidden
-            exact = align_exactly(reference, self._levels.get(keyframe), guess, before)
+            there = self.graph.keyframes[keyframe].hidden
+            exact = align_exactly(reference, self._levels.get(keyframe), guess, there)
             if exact.reference_from_view is None:
                 return False
             keyframe_from_frame = geometry.inverted(exact.reference_from_view)
@@ -285,6 +311,27 @@ class MovingCamera:
         self._go_over(index, np.eye(3))
         self._loops.add(NewKeyframe(index, reference, keyframe, found if is_sure else None))
         return True
+
+    def _new_reference(
+        self,
+        levels: ViewLevels,
+        before: _State | None,
+        hidden: Sequence[Points],
+        keyframe: int,
+        found: ViewAlignment,
+    ) -> ReferenceView:
+        """The view of a new keyframe, without what has moved by itself since the frame before."""
+        reference = ReferenceView(levels, hidden)
+        is_doubtful = self._doubts.about(keyframe) or self.graph.keyframes[keyframe].hidden
+        if before is None or before.keyframe != keyframe or not is_doubtful:
+            return reference
+        assert found.reference_from_view is not None
+        here_from_before = geometry.inverted(found.reference_from_view) @ before.keyframe_from_frame
+        ours = replace(found, reference_from_view=here_from_before)
+        layers = separated(reference, before.levels, ours, hidden)
+        if layers.background is not ours:
+            return reference
+        return ReferenceView(levels, (*hidden, *layers.foreground))
 
     def _take(
         self, view: FrameView, reference: ReferenceView, world_from_frame: Matrix, link: Link | None

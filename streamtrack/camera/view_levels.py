@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.types import Image, Matrix, Points, Size
+from streamtrack.types import Image, Mask, Matrix, Points, Size
 
 Floats: TypeAlias = npt.NDArray[np.float32]
 Rows: TypeAlias = npt.NDArray[np.intp]
@@ -102,11 +102,17 @@ class Pixels:
 class ReferenceView:
     """A view that others are aligned with: its textured pixels at every level."""
 
-    def __init__(self, levels: ViewLevels, hidden: Sequence[Points] = ()) -> None:
-        """``hidden`` are quads (4, 2) in the view that do not belong to the scene."""
+    def __init__(
+        self, levels: ViewLevels, hidden: Sequence[Points] = (), masked: Mask | None = None
+    ) -> None:
+        """``hidden`` are quads (4, 2) in the view that do not belong to the scene.
+
+        Nor does what is ``masked`` (h, w), a mask of the view at any resolution.
+        """
         self.levels = levels
         self.size_wh = levels.size_wh
         self.hidden = tuple(hidden)
+        self._masked = masked
         self._pixels: dict[int, Pixels] = {}
 
     @property
@@ -117,11 +123,13 @@ class ReferenceView:
     def pixels(self, level: int) -> Pixels:
         """The chosen pixels of a level, chosen when first asked for."""
         if level not in self._pixels:
-            self._pixels[level] = _choose_pixels(self.levels, level, self.hidden)
+            self._pixels[level] = _choose_pixels(self.levels, level, self.hidden, self._masked)
         return self._pixels[level]
 
 
-def _choose_pixels(levels: ViewLevels, level: int, hidden: Sequence[Points]) -> Pixels:
+def _choose_pixels(
+    levels: ViewLevels, level: int, hidden: Sequence[Points], masked: Mask | None
+) -> Pixels:
     values = levels.high_passed(level)
     gx = np.asarray(cv2.Sobel(values, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8), np.float32)
     gy = np.asarray(cv2.Sobel(values, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8), np.float32)
@@ -134,6 +142,10 @@ def _choose_pixels(levels: ViewLevels, level: int, hidden: Sequence[Points]) -> 
         if np.isfinite(seen).all():
             outline = np.rint(np.clip(seen, -1e6, 1e6)).astype(np.int32)
             cv2.fillConvexPoly(strength, outline, 0.0)
+    if masked is not None:
+        size = values.shape[1], values.shape[0]
+        spread = cv2.resize(masked.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        strength[spread > 0] = 0
     row, column, cell = _strongest(strength, _CELL_PIXELS[level])
     height, width = values.shape
     unit = 2.0 / max(width, height)

@@ -7,6 +7,8 @@ lost most, and the length is the one that costs the template as much.
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -51,14 +53,21 @@ def motion_blur(template: Image, seen: Image, area: Mask) -> Doubles:
 
 def with_best_length(template: Image, seen: Image, area: Mask, vector: Doubles) -> Doubles:
     """``vector`` made longer or shorter, as ``seen``, now well aligned, correlates best."""
-    values = seen[area].astype(np.float64)
+    values = seen[area].astype(np.float32)
+    values -= values.mean()
 
-    def correlation(factor: float) -> float:
-        smeared = smeared_along(template, vector * factor)[area].astype(np.float64)
-        return float(np.corrcoef(smeared, values)[0, 1])
+    @cache
+    def correlation(place: int) -> float:
+        smeared = smeared_along(template, vector * _FACTORS[place])[area].astype(np.float32)
+        smeared -= smeared.mean()
+        return float(smeared @ values) / (float(np.linalg.norm(smeared)) + 1e-6)
 
-    best = max(_FACTORS, key=correlation)
-    return vector * best
+    # There is one best length, so from no change it is uphill.
+    best = _FACTORS.index(1.0)
+    for step in (-1, 1):
+        while 0 <= best + step < len(_FACTORS) and correlation(best + step) > correlation(best):
+            best += step
+    return vector * _FACTORS[best]
 
 
 def smeared_along(image: Image, vector: Doubles) -> Image:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from math import inf, isfinite, sqrt
 from typing import Any
 
@@ -23,15 +24,14 @@ def transform_points(b_from_a: Matrix, points: npt.ArrayLike) -> Points:
     (a, b, c), (d, e, f), (g, h, i) = b_from_a.tolist()
     if len(pts) <= _FEW:
         # Without numpy's overhead, which for the corners of a quad is nearly all there is.
-        corners = pts.tolist()
-        depths = [g * x + h * y + i for x, y in corners]
-        if all(abs(depth) > _NEAR_HORIZON for depth in depths):
-            mapped = [
-                ((a * x + b * y + c) / depth, (d * x + e * y + f) / depth)
-                for (x, y), depth in zip(corners, depths, strict=True)
-            ]
-            with np.errstate(over="ignore"):
-                return np.array(mapped, np.float32).reshape(-1, 2)
+        mapped = array("f")
+        for x, y in pts.tolist():
+            depth = g * x + h * y + i
+            if not abs(depth) > _NEAR_HORIZON:
+                break
+            mapped.extend(((a * x + b * y + c) / depth, (d * x + e * y + f) / depth))
+        else:
+            return np.frombuffer(mapped, np.float32).reshape(-1, 2)
     x, y = np.ascontiguousarray(pts.T, np.float64)
     result: Points = np.empty((len(pts), 2), np.float32)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

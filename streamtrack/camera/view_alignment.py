@@ -32,7 +32,7 @@ from streamtrack.camera.view_levels import (
 )
 from streamtrack.camera.view_verdict import Fitted, ViewAlignment, judged, refusal
 from streamtrack.registration import judge_mapping
-from streamtrack.types import Mask, Matrix, Points, Verdict
+from streamtrack.types import Image, Matrix, Points, Verdict
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
@@ -303,8 +303,8 @@ def _in_view(
     height, width = shape
     inside = (x >= edge) & (y >= edge) & (x < width - 1 - edge) & (y < height - 1 - edge)
     inside &= depth > 0
-    for outline in outlines:
-        inside &= ~_within(outline, x, y)
+    if outlines:
+        inside[inside] = _filled(outlines, shape)[_rounded(y[inside]), _rounded(x[inside])] == 0
     if inside.all():
         return pixels
     rows = np.flatnonzero(inside)
@@ -324,13 +324,17 @@ def _projected(mapping: Matrix, points: Floats) -> tuple[Floats, Floats, Floats]
         return moved[0] / moved[2], moved[1] / moved[2], moved[2]
 
 
-def _within(outline: Points, x: Floats, y: Floats) -> Mask:
-    """Which points (N,) lie in a convex quad (4, 2)."""
-    inside = np.ones(len(x), np.bool_)
-    turned = np.sign(geometry.signed_area(outline))
-    for (x0, y0), (x1, y1) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
-        inside &= ((x1 - x0) * (y - y0) - (y1 - y0) * (x - x0)) * turned >= 0
-    return inside
+def _filled(outlines: Sequence[Points], shape: tuple[int, ...]) -> Image:
+    """A picture (h, w) that is 1 inside the quads (4, 2)."""
+    filled = np.zeros(shape, np.uint8)
+    for outline in outlines:
+        if np.isfinite(outline).all():
+            cv2.fillConvexPoly(filled, np.rint(np.clip(outline, -1e4, 1e4)).astype(np.int32), 1)
+    return filled
+
+
+def _rounded(values: Floats) -> npt.NDArray[np.intp]:
+    return (values + np.float32(0.5)).astype(np.intp)
 
 
 def _sampled(values: Floats, mapping: Matrix, points: Floats) -> Floats:

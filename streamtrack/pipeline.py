@@ -140,7 +140,7 @@ def _follow_all(
         began_ms, detect_ms = clock.total_ms, view.detect_ms
         tracks.append(tracker.update(view))
         spent_ms = clock.total_ms - began_ms - (view.detect_ms - detect_ms)
-        clock.add("flow" if tracks[-1].means in ("flow", "view") else "match", spent_ms)
+        clock.add("flow" if tracks[-1].means in ("flow", "view", "body") else "match", spent_ms)
     return tuple(tracks)
 
 

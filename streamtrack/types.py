@@ -321,9 +321,10 @@ class Track:
     ``quad``, ``frame_from_template`` and ``model`` are None unless the state is TRACKING.
     Template pixels are those of the picture in which the target was given: the first frame,
     or the template picture. ``reason`` says in words why the target is not tracked, and is
-    empty otherwise. ``means`` names the way the result was found (``flow``, ``guided``, ``global``,
-    ``detect``); ``correlation`` is the normalised cross-correlation of target and picture, or NaN.
-    ``world`` is where it is in the world; None if that or the camera's pose is not known.
+    empty otherwise. ``means`` names the way the result was found (``flow``, ``view``, ``body``,
+    ``guided``, ``global``, ``detect``); a ``body``, which is not flat, has no point pairs as
+    evidence and no RMSE. ``correlation`` is the normalised cross-correlation of target and picture,
+    or NaN. ``world`` is where it is in the world; None if that or the camera's pose is not known.
     ``is_found`` marks an automatic target: it was found by its motion (``means`` ``motion``, or
     ``carried`` where only its pixels' motion was seen) and may end any time.
     """

@@ -18,7 +18,7 @@ _LEANING = np.array([[0.9, 0.02, 5.0], [-0.01, 1.0, 3.0], [3e-4, 1e-4, 1.0]])
 def _learned(pose: Matrix, share: float, frames: int) -> bool:
     flatness = Flatness(_QUAD)
     for _ in range(frames):
-        flatness.learn(pose, share, 0.9)
+        flatness.learn(pose, share, share, 0.9)
     return flatness.is_proven
 
 
@@ -41,7 +41,7 @@ def test_a_slant_that_many_points_contradict_proves_nothing() -> None:
 def test_what_is_left_of_a_hidden_thing_looks_as_ever_and_what_turns_away_does_not() -> None:
     flatness = Flatness(_QUAD)
     for correlation in (0.93, 0.9, 0.91, 0.92):
-        flatness.learn(np.eye(3), 0.95, correlation)
+        flatness.learn(np.eye(3), 0.95, 1.0, correlation)
     assert flatness.least_correlation < 0.91
     assert flatness.least_correlation > 0.85
 
@@ -53,5 +53,5 @@ def test_before_it_was_seen_nothing_looks_as_ever() -> None:
 def test_a_plane_may_look_otherwise() -> None:
     flatness = Flatness(_QUAD)
     for _ in range(5):
-        flatness.learn(_LEANING, 0.9, 0.9)
+        flatness.learn(_LEANING, 0.9, 0.9, 0.9)
     assert flatness.least_correlation <= -1.0

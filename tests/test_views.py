@@ -54,7 +54,7 @@ def test_a_bending_target_is_kept_and_the_box_stays_on_it(bent: list[Image]) -> 
     tracks = _follow(bent)
     kept = [t.state is TrackState.TRACKING for t in tracks]
     assert np.mean(kept) >= 0.95
-    assert any(t.means == "view" for t in tracks)
+    assert any(t.means == "body" for t in tracks)
     left, top, width, height = _BOX
     for number, found in enumerate(tracks):
         if found.quad is not None:

@@ -33,6 +33,7 @@ class Alignment:
     template_points, frame_points  float32 (N, 2) of those that are
     registration                   frame_from_template with its verdict
     correlation                    mean local correlation of the points that support the pose
+    alike                          share (0..1) of the points in view that look like the template
     """
 
     registration: Registration
@@ -40,6 +41,7 @@ class Alignment:
     template_points: Points
     frame_points: Points
     correlation: float
+    alike: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +117,7 @@ def refusal(verdict: Verdict, in_view: Mask, template_points: Points) -> Alignme
     """An alignment that says why there is no pose, for all points that are in view."""
     unknown = np.full_like(template_points, np.nan)
     registration = refused(verdict, len(template_points))
-    return Alignment(registration, in_view, template_points, unknown, float("nan"))
+    return Alignment(registration, in_view, template_points, unknown, float("nan"), 0.0)
 
 
 def withdrawn(alignment: Alignment, verdict: Verdict) -> Alignment:

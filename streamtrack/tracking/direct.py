@@ -116,7 +116,8 @@ def _checked(
     frame_points = geometry.transform_points(frame_from_patch, points + shift)
     errors = transfer_errors(found.pose, template_points, frame_points)
     is_near = errors < INLIER_PX * patch.frame_px(found.pose)
-    is_inlier = (correlation >= MIN_CORRELATION) & is_near
+    is_like = correlation >= MIN_CORRELATION
+    is_inlier = is_like & is_near
     region = geometry.transform_points(patch.patch_from_template, template.quad)
     verdict = judge_support(points, is_inlier, settings, region, (2 * SEARCH_PX) ** 2)
     if verdict is not Verdict.OK:
@@ -127,4 +128,5 @@ def _checked(
         model = Model(settings.model)
     registration = Registration(Verdict.OK, found.pose, model, is_inlier, rmse_px)
     mean_correlation = float(correlation[is_inlier].mean())
-    return Alignment(registration, visible, template_points, frame_points, mean_correlation)
+    alike = float(np.mean(is_like))
+    return Alignment(registration, visible, template_points, frame_points, mean_correlation, alike)

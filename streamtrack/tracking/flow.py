@@ -206,7 +206,8 @@ class FlowAligner:
         mean = float(correlation[supported].mean()) if supported.any() else float("nan")
         if registration.verdict is Verdict.OK and share < _MIN_SUPPORTED_SHARE:
             registration = refused(Verdict.LOW_CORRELATION, len(supported), supported)
-        return Alignment(registration, visible, template_points, frame_points, mean)
+        alike = float(np.mean(is_like))
+        return Alignment(registration, visible, template_points, frame_points, mean, alike)
 
     def _estimate(
         self,

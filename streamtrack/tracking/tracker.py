@@ -3,8 +3,8 @@
 Two methods with one interface. `DetectTracker` is the ancestor's loop: every frame by itself,
 its features against the target's. `HybridTracker` predicts the pose, warps the frame back by it,
 measures the remaining flow against the first-frame picture, and falls back on features, first
-near the prediction and then everywhere, when the gate refuses. Both say ``lost`` at once, and
-neither ever repeats an old quad.
+near the prediction and then everywhere, when the gate refuses; a target that turns out not to be
+flat goes on as a `Body`. Both say ``lost`` at once, and neither ever repeats an old quad.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from streamtrack.tracking.appearance import (
     chroma_distance,
     prepare_colors,
 )
+from streamtrack.tracking.body import Body
 from streamtrack.tracking.flatness import Flatness
 from streamtrack.tracking.flow import FlowAligner
 from streamtrack.tracking.prediction import Prediction
@@ -67,6 +68,8 @@ _VIEW_ADVANTAGE = 0.3  # in share of points, of a recent view over the first
 _RENEWED_BELOW_SHARE = 0.75
 _FRAMES_BETWEEN_VIEWS = 4  # after a view that did not help
 _FRAMES_BETWEEN_NEAR = 3  # after a guess that was not as good as hoped: blur stays for a while
+_BODY_COAST_FRAMES = 30  # lost frames in which a body is looked for at its last place
+_FRAMES_BETWEEN_PLANES = 24  # of a body, in which it is asked whether it is flat after all
 _COLOR_REACH_SHARE = 0.04  # of the target's size: how far around a point colours are compared
 
 
@@ -115,6 +118,8 @@ class HybridTracker:
         self._aligner = FlowAligner(template, settings.registration)
         self._views = RecentViews(template, settings.registration)
         self._is_in_view = False
+        self._body: Body | None = None
+        self._body_frames = 0
         self._flatness = Flatness(template.quad)
         self._frames_to_next_view = 0
         self._frames_to_next_near = 0
@@ -128,16 +133,20 @@ class HybridTracker:
         self._last_share = 0.0
         self._last_seen = 0.0
         self._was_seen = first_pose is not None
-        is_same_camera = first_pose is not None
+        self._is_same_camera = first_pose is not None
         self._max_chroma_distance = (
-            MAX_CHROMA_DISTANCE if is_same_camera else MAX_CHROMA_DISTANCE_OTHER_CAMERA
+            MAX_CHROMA_DISTANCE if self._is_same_camera else MAX_CHROMA_DISTANCE_OTHER_CAMERA
         )
         prepare_colors(template.picture)
 
     def update(self, view: FrameView) -> Track:
-        was_in_view = self._is_in_view
         self._views.was_made_now = False
-        followed = self._follow(view)
+        if self._body is not None:
+            seen = self._follow_body(self._body, view)
+            if seen is not None:
+                return seen
+        was_in_view = self._is_in_view
+        followed = None if self._body is not None else self._follow(view)
         recent = self._follow_views(view, followed)
         if recent is not None:
             return self._tracked(recent, "view")
@@ -146,10 +155,19 @@ class HybridTracker:
         pose = None if followed is None else followed.registration.b_from_a
         if followed is not None and pose is not None:
             share = agreeing_share(followed)
-            self._flatness.learn(pose, share, followed.correlation)
+            self._flatness.learn(pose, share, followed.alike, followed.correlation)
             if self._flatness.is_proven or share >= _REMEMBERED_SHARE:
                 self._views.remember(view, followed)
+            if self._flatness.is_disproven:
+                self._body = self._begun_body()
             return self._tracked(followed, "flow")
+        if self._body is None and followed is not None and self._frames_lost == 0:
+            if self._flatness.may_be_body(followed.alike):
+                self._body = self._begun_body()
+            seen = None if self._body is None else self._follow_body(self._body, view)
+            if seen is not None:
+                return seen
+            self._body = None
         self._views.forget()
         # Making a view takes as long as a search: not both in one frame.
         if self._views.was_made_now or not self._is_searched_in(view):
@@ -161,6 +179,7 @@ class HybridTracker:
                 confirmed = withdrawn(confirmed, Verdict.LOW_CORRELATION)
             confirmed = self._with_own_colors(confirmed, view)
             if confirmed.registration.verdict is Verdict.OK:
+                self._body = None
                 return self._tracked(confirmed, means)
             detected = confirmed.registration
         self._frames_lost += 1
@@ -169,6 +188,7 @@ class HybridTracker:
 
     def forget_place(self) -> None:
         self._prediction.forget()
+        self._body = None
         self._frames_lost = 1
         self._views.forget()
 
@@ -270,6 +290,48 @@ class HybridTracker:
         if share < _RENEWED_BELOW_SHARE:
             self._views.renew()
         return recent
+
+    def _begun_body(self) -> Body | None:
+        """The target as a body, as its newest clear sight shows it; None if it may not be one."""
+        sight = self._views.newest
+        if sight is None or self._flatness.is_proven or not self._uses_views:
+            return None
+        self._body_frames = 0
+        if not self._is_same_camera:
+            return Body(sight.image, sight.frame_from_template, self.template.quad)
+        body = Body(self.template.picture, np.eye(3), self.template.quad)
+        body.take_over(sight.image, sight.template_points, sight.shown)
+        return body
+
+    def _follow_body(self, body: Body, view: FrameView) -> Track | None:
+        """The track of a target that is not flat; None if it is not seen near its last place."""
+        assert self._prediction.pose is not None
+        was_lost = self._frames_lost > 0
+        if self._frames_lost > _BODY_COAST_FRAMES:
+            self._body = None
+            return None
+        pose = body.follow(
+            view.frame.image, self._prediction.guess, was_lost=was_lost or self._body_frames == 0
+        )
+        if pose is None:
+            if self._body_frames == 0:
+                self._body = None
+            return None
+        self._body_frames += 1
+        if self._body_frames % _FRAMES_BETWEEN_PLANES == 1:
+            plane = self._aligner.align(view, pose)
+            if self._flatness.is_plane(agreeing_share(plane), plane.alike, plane.correlation):
+                self._body = None
+                return self._tracked(plane, "flow")
+        if was_lost:
+            self._prediction.begin_at(pose, 1.0)
+        else:
+            self._prediction.follow(pose, is_clear=True)
+        self._frames_lost = self._searches = 0
+        found = Registration(
+            Verdict.OK, pose, Model.SIMILARITY, np.zeros(0, np.bool_), float("nan")
+        )
+        return make_track(self.template, found, Evidence(), "body", self._was_seen)
 
     def _hope(self) -> Hope | None:
         """What to expect of the guess, if the target was well predicted in the last frames."""

@@ -20,7 +20,7 @@ from streamtrack.settings import RegistrationSettings
 from streamtrack.tracking.alignment import Alignment, Hope, agreeing_share
 from streamtrack.tracking.flow import FlowAligner
 from streamtrack.tracking.template import MIN_FLOW_POINTS, Template, make_passing_patches
-from streamtrack.types import Matrix, Model, Points
+from streamtrack.types import Image, Matrix, Model, Points
 
 MIN_VIEW_SHARE = 0.6
 """Share of a recent view's points that must agree."""
@@ -28,15 +28,18 @@ _HOPED_SHARE = 0.75
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Sight:
-    """One clear sight of the target: the frame in grey, the pose in it, and where it was seen.
+class Sight:
+    """One clear sight of the target: the frame, in grey too, the pose in it, and where it was seen.
 
-    ``shown`` (N, 2) are the points of this frame that agreed with the pose.
+    ``shown`` (N, 2) are the points of this frame that agreed with the pose, ``template_points`` the
+    same in template pixels.
     """
 
+    image: Image
     pyramid: Pyramid
     frame_from_template: Matrix
     shown: Points
+    template_points: Points
 
 
 class RecentViews:
@@ -46,8 +49,8 @@ class RecentViews:
         self._template = template
         self._flat_settings = settings
         self._settings = settings.model_copy(update={"model": Model.SIMILARITY.value})
-        self._newest: _Sight | None = None
-        self._in_use: _Sight | None = None
+        self.newest: Sight | None = None
+        self._in_use: Sight | None = None
         self._aligner: FlowAligner | None = None
         self.was_made_now = False
         """Was a template made since this was last set to False?"""
@@ -57,11 +60,13 @@ class RecentViews:
         found = alignment.registration
         if found.b_from_a is not None:
             shown = alignment.frame_points[found.is_inlier]
-            self._newest = _Sight(view.pyramid, found.b_from_a, shown)
+            points = alignment.template_points[found.is_inlier]
+            image, pyramid = view.frame.image, view.pyramid
+            self.newest = Sight(image, pyramid, found.b_from_a, shown, points)
 
     def forget(self) -> None:
         """The target was lost: what it looked like then says little about where it is now."""
-        self._newest = self._in_use = self._aligner = None
+        self.newest = self._in_use = self._aligner = None
 
     def take_as_flat(self) -> None:
         """From now on every view is mapped by a homography, as a plane is."""
@@ -78,20 +83,20 @@ class RecentViews:
         aligned = self._align_in_use(view, guess, sigma_px)
         if aligned is not None and agreeing_share(aligned) >= MIN_VIEW_SHARE:
             return aligned
-        if self._newest is None or self._newest is self._in_use:
+        if self.newest is None or self.newest is self._in_use:
             return aligned
         self._use_newest()
         return self._align_in_use(view, guess, sigma_px)
 
     def renew(self) -> None:
         """Compare with the newest sight from now on."""
-        if self._newest is not None and self._newest is not self._in_use:
+        if self.newest is not None and self.newest is not self._in_use:
             self._use_newest()
 
     def _use_newest(self) -> None:
-        assert self._newest is not None
+        assert self.newest is not None
         self.was_made_now = True
-        sight = self._in_use = self._newest
+        sight = self._in_use = self.newest
         quad = geometry.transform_points(sight.frame_from_template, self._template.quad)
         patches = make_passing_patches(sight.pyramid, quad, sight.shown)
         if not patches or len(patches[0].points) < MIN_FLOW_POINTS:

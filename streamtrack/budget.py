@@ -1,10 +1,14 @@
 """Keeping to a time a frame by doing less, in stated steps.
 
-Each level halves the area that is aligned and the features that are looked for; the lowest also
-search for lost targets only now and then. The level goes down when frames take longer than the
-budget and up again when there is room, so with a budget results depend on the machine's speed;
-without one they never do. A frame of a live source takes from when it lay ready: whatever keeps
-the run (writing, other programs), work goes down while it is late.
+The first step aligns half the area, the others look for fewer features and, for lost targets, less
+often. Targets are not aligned more coarsely than that: a quarter of the area costs no less, as more
+alignments fail and are repeated, and corners go wrong. What then still takes too long the summary
+tells; a live source drops the pictures that there is no time for.
+
+The level goes down when frames take longer than the budget and up again when there is room, so with
+a budget results depend on the machine's speed; without one they never do. A frame of a live source
+takes from when it lay ready: whatever keeps the run (writing, other programs), work goes down while
+it is late.
 """
 
 from __future__ import annotations
@@ -30,8 +34,8 @@ class WorkLevel:
 LEVELS = (
     WorkLevel(0, 0, 1.0, 1),
     WorkLevel(1, 1, 0.5, 1),
-    WorkLevel(2, 2, 0.35, 2),
-    WorkLevel(3, 3, 0.25, 4),
+    WorkLevel(2, 1, 0.35, 2),
+    WorkLevel(3, 1, 0.25, 4),
 )
 FULL_WORK = LEVELS[0]
 

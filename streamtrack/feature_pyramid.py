@@ -88,14 +88,21 @@ def _level_size(size_wh: Size, number: int) -> Size:
 
 
 def pyramid(grey: Image, deepest: int | None = None) -> list[tuple[Image, npt.NDArray[np.float64]]]:
-    """(level picture, full_from_level), each smaller by `PYRAMID_STEP`, down to the ``deepest``."""
+    """(level picture, full_from_level), each smaller by `PYRAMID_STEP`, down to the ``deepest``.
+
+    Every second level halves the one two above it, the others lie between: OpenCV takes a mean
+    over areas fast only where they are whole pixels, and for one step of `PYRAMID_STEP` linear
+    interpolation smooths as much, in a tenth of the time.
+    """
     size_wh = grey.shape[1], grey.shape[0]
     count = level_count(size_wh) if deepest is None else deepest + 1
     levels = [(grey, np.eye(3))]
     for number in range(1, count):
         width, height = _level_size(size_wh, number)
-        source = levels[-2][0] if len(levels) >= 2 else grey
-        level = cv2.resize(source, (width, height), interpolation=cv2.INTER_AREA)
+        is_between = number % 2 == 1
+        source = levels[-1 if is_between else -2][0]
+        interpolation = cv2.INTER_LINEAR_EXACT if is_between else cv2.INTER_AREA
+        level = cv2.resize(source, (width, height), interpolation=interpolation)
         full_from_level = scaling(size_wh[0] / width, size_wh[1] / height)
         levels.append((np.asarray(level, np.uint8), full_from_level))
     return levels

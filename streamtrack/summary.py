@@ -7,7 +7,8 @@ inliers, transformation model. Definitions:
     matches        point pairs behind a track (its evidence), over all tracked target-frames
     inliers        those of them that agree with the estimate
     rmse_px        mean over the tracked frames of the inliers' RMS transfer error
-    budget         null without one; ``frames_at_level`` counts frames by level of work, full first
+    budget         null without one; ``frames_at_level`` counts frames by level of work, full first,
+                   ``frames_over`` those that took longer, waiting for their turn included
     automatic      targets found by their motion; ``most_at_once`` of them tracked in one frame;
                    of more than 1000 those seen last are listed
     losses         changes from tracking to lost
@@ -57,6 +58,7 @@ class Summary:
     ms_p95: float | None
     ms_by_stage: dict[str, float]
     frames_at_level: tuple[int, ...]
+    frames_over_budget: int
     time_s: float
     peak_rss_mb: float
     skipped: tuple[Skipped, ...]
@@ -166,7 +168,11 @@ class Summary:
         budget_ms = self.settings.tracker.budget_ms
         if budget_ms is None:
             return None
-        return {"ms": budget_ms, "frames_at_level": list(self.frames_at_level)}
+        return {
+            "ms": budget_ms,
+            "frames_at_level": list(self.frames_at_level),
+            "frames_over": self.frames_over_budget,
+        }
 
     def _auto_json(self) -> dict[str, int] | None:
         if self.auto_at_once is None:
@@ -195,9 +201,11 @@ class Summary:
         if budget_ms is None:
             return []
         frames = [f"level {level} {count}" for level, count in enumerate(self.frames_at_level)]
-        return [
-            ("Time budget", f"{budget_ms:g} ms; frames at each level of work: {', '.join(frames)}")
-        ]
+        text = (
+            f"{budget_ms:g} ms, exceeded in {self.frames_over_budget} of {self.frames} frames; "
+            f"frames at each level of work: {', '.join(frames)}"
+        )
+        return [("Time budget", text)]
 
     def to_markdown(self) -> str:
         """The table, and a list of the pictures that were left out."""
@@ -240,6 +248,7 @@ class SummaryBuilder:
         self._auto_at_once: int | None = None
         self._auto_count = 0
         self._frames_at_level = [0] * len(LEVELS)
+        self._frames_over_budget = 0
         self._ms = LogHistogram()
         self._stage_ms: dict[str, float] = {}
 
@@ -261,7 +270,7 @@ class SummaryBuilder:
         if AUTO_STAGE in step.stage_ms:
             found = sum(track.is_found and track.quad is not None for track in step.tracks)
             self._auto_at_once = max(found, self._auto_at_once or 0)
-        self._add_times(step.stage_ms)
+        self._add_times(step.stage_ms, step.frame.waited_s * 1e3)
 
     def _add_track(self, track: Track, frame: int) -> None:
         if track.name not in self._targets:
@@ -281,9 +290,12 @@ class SummaryBuilder:
             oldest = min(found, key=lambda target: target.last_seen or 0)
             del self._targets[oldest.name]
 
-    def _add_times(self, stage_ms: dict[str, float]) -> None:
+    def _add_times(self, stage_ms: dict[str, float], waited_ms: float) -> None:
         stages = {name: ms for name, ms in stage_ms.items() if name != "total"}
-        self._ms.add(stage_ms.get("total", sum(stages.values())))
+        total_ms = stage_ms.get("total", sum(stages.values()))
+        self._ms.add(total_ms)
+        budget_ms = self._settings.tracker.budget_ms
+        self._frames_over_budget += budget_ms is not None and total_ms + waited_ms > budget_ms
         for name, ms in stages.items():
             if math.isfinite(ms):
                 self._stage_ms[name] = self._stage_ms.get(name, 0.0) + ms
@@ -316,6 +328,7 @@ class SummaryBuilder:
             ms_p95=self._ms.quantile(0.95),
             ms_by_stage={name: ms / self._frames for name, ms in self._stage_ms.items()},
             frames_at_level=tuple(self._frames_at_level),
+            frames_over_budget=self._frames_over_budget,
             time_s=self._clock() - self._started,
             peak_rss_mb=peak_rss_mb(),
             skipped=tuple(skipped),

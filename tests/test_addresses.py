@@ -12,9 +12,24 @@ from streamtrack.sources.addresses import (
     check_network_address,
     is_live,
     kind_of,
+    path_of,
     redacted,
 )
 from streamtrack.types import SourceInfo
+
+
+@pytest.mark.parametrize(
+    ("address", "path"),
+    [
+        ("file:///tmp/a%20b%23.mp4", "/tmp/a b#.mp4"),
+        ("FILE://localhost/tmp/a.mp4", "/tmp/a.mp4"),
+        ("file://elsewhere/a.mp4", "file://elsewhere/a.mp4"),
+        ("a%20b.mp4", "a%20b.mp4"),
+        ("rtsp://host/x", "rtsp://host/x"),
+    ],
+)
+def test_a_file_address_of_this_machine_is_its_path(address: str, path: str) -> None:
+    assert path_of(address) == path
 
 
 @pytest.mark.parametrize(

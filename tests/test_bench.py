@@ -199,6 +199,15 @@ def test_the_usual_set_has_every_scene_both_sizes_and_both_kinds_of_texture() ->
     assert len({scenario.name for scenario in kinds}) == len(kinds)
 
 
+def test_the_help_says_what_is_run_without_options() -> None:
+    chosen = synthetic_scenarios(None, [1], None, is_quick=False)
+    kinds = [scenario for scenario in chosen if isinstance(scenario, SyntheticScenario)]
+    assert len(kinds) == 17 and sum(scenario.frames for scenario in kinds) == 1440
+    assert sum(scenario.size_wh == (1280, 720) for scenario in kinds) == 4
+    quick = synthetic_scenarios(None, [1], None, is_quick=True)
+    assert len(quick) == 9
+
+
 @pytest.fixture
 def pot_folder(tmp_path: Path) -> Path:
     """A POT sequence that begins with a row that is not annotated, and one odd flag."""

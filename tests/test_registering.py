@@ -11,11 +11,11 @@ from streamtrack import geometry
 from streamtrack.errors import UsageError
 from streamtrack.evaluation import corner_error, visible_error
 from streamtrack.features import no_features
-from streamtrack.fitting import fit, transfer_errors
+from streamtrack.fitting import transfer_errors
 from streamtrack.mosaic.pairs import direct
 from streamtrack.mosaic.pairs.agreement import Agreement, measure_agreement
 from streamtrack.mosaic.pairs.first_estimate import estimate, estimate_by_zoom
-from streamtrack.mosaic.pairs.link_gate import corner_sigma_px, judge_link, overlap_in
+from streamtrack.mosaic.pairs.link_gate import judge_link, overlap_in
 from streamtrack.mosaic.pairs.registering import PictureRegistrar
 from streamtrack.mosaic.pairs.subpixel import render_overlap, tracked_corners
 from streamtrack.mosaic.types import Link
@@ -162,12 +162,12 @@ def test_any_features_lead_to_the_same_place(
 
 
 def test_a_large_zoom_is_found_at_the_second_look(make_picture: MakePicture) -> None:
-    """Few keypoints of a picture have a partner in one that shows 1/9 of it, 3 times as large."""
+    """Few keypoints of a picture have a partner in one that shows 1/7 of it, 2.6 times as large."""
     settings = build_settings({"features": {"max_features": 400}})
     registrar = PictureRegistrar(settings)
     found = []
     for seed in range(10, 14):
-        scene, truth = make_picture(seed, SCENE), similarity(3.2, 20.0, 0.0, 0.0)
+        scene, truth = make_picture(seed, SCENE), similarity(2.6, 20.0, 0.0, 0.0)
         a, b = (registrar.picture(i, "", p).features for i, p in enumerate(pair_of(scene, truth)))
         area = float(SIZE[0] * SIZE[1])
         first = estimate(a, b, area, settings)
@@ -299,21 +299,6 @@ def test_agreement_tells_right_from_wrong(make_picture: MakePicture) -> None:
     good, bad = measure_agreement(right), measure_agreement(wrong)
     assert good.alike > 0.95 and good.detail > 0.8 and good.tiles > 50
     assert bad.alike < 0.15 and bad.detail < 0.1
-
-
-def test_corner_sigma_is_what_noise_does(rng: np.random.Generator) -> None:
-    """Against the spread of the least squares over many draws of the noise."""
-    truth = MAPPINGS["zoom in"]
-    a = rng.uniform((150, 100), (250, 200), (25, 2)).astype(np.float32)
-    clean, spreads, sigmas = geometry.transform_points(truth, a), [], []
-    for _ in range(150):
-        b = (clean + rng.normal(0, 0.2, a.shape)).astype(np.float32)
-        found = fit(Model.AFFINE, a, b)
-        seen = geometry.transform_points(found, geometry.image_quad(SIZE))
-        spreads.append(seen.astype(np.float64))
-        sigmas.append(corner_sigma_px(found, Model.AFFINE, a, b, SIZE))
-    deviation = np.sqrt(np.var(np.array(spreads), axis=0).sum(axis=1))
-    assert np.mean(sigmas) == pytest.approx(float(np.max(deviation)), rel=0.25)
 
 
 def gate(b_from_a: Matrix, points: int = 60, inliers: int = 60, spread: float = 1.0) -> Verdict:

@@ -41,8 +41,7 @@ def associate(things: Sequence[Followed], blobs: Sequence[Blob], reach_px: float
     """Pair things, already predicted, with blobs; ``reach_px`` is added to every gate."""
     wholes = _put_together(things, blobs, reach_px)
     found = dict(assign(_costs(things, wholes, reach_px)))
-    shared = {column: _sharing(things, blob, column, found) for column, blob in enumerate(wholes)}
-    shared = {column: rows for column, rows in shared.items() if rows}
+    shared = _sharing(things, wholes, found)
     told = {row for rows in shared.values() for row in rows}
     taken = set(found.values())
     return Associated(
@@ -50,6 +49,24 @@ def associate(things: Sequence[Followed], blobs: Sequence[Blob], reach_px: float
         tuple((tuple(things[r] for r in rows), wholes[c]) for c, rows in shared.items()),
         tuple(blob for column, blob in enumerate(wholes) if column not in taken),
     )
+
+
+def found_again(thing: Followed, others: Sequence[Followed], reach_px: float) -> Followed | None:
+    """The lost thing that a new one is: of its colours, where it may be by now, moving alike."""
+    nearest, least = None, np.inf
+    for lost in others:
+        if lost.life is not Life.LOST:
+            continue
+        speed = float(np.hypot(*lost.velocity))
+        extents = float(np.hypot(*thing.size) + np.hypot(*lost.size))
+        gate_px = 0.3 * extents + reach_px + 0.5 * lost.lost_s * speed
+        off_px = float(np.hypot(*(thing.center - lost.center)))
+        color = np.sqrt(max(0.0, 1.0 - float(np.sqrt(thing.colors * lost.colors).sum())))
+        apart = float(np.hypot(*(thing.velocity - lost.velocity)))
+        is_alike = color < _MAX_COLOR_DISTANCE and apart < 0.5 * (speed + reach_px)
+        if is_alike and off_px < min(gate_px, least):
+            nearest, least = lost, off_px
+    return nearest
 
 
 def _costs(things: Sequence[Followed], blobs: Sequence[Blob], reach_px: float) -> Doubles:
@@ -139,17 +156,23 @@ def _moves_otherwise(blob: Blob, larger: Blob, reach_px: float) -> bool:
 
 
 def _sharing(
-    things: Sequence[Followed], blob: Blob, column: int, found: dict[int, int]
-) -> list[int]:
-    """The things (rows) that a blob shows together; none if it shows one at most."""
-    area = float(np.prod(blob.size))
-    within = [
-        row
-        for row, thing in enumerate(things)
-        if thing.life is not Life.NEW
-        and (thing.life is not Life.LOST or found.get(row) == column)
-        and found.get(row, column) == column
-        and overlap(thing.box, blob.box)[1] >= _SHARED_INSIDE
-    ]
-    is_larger = all(area > _SHARED_LARGER * float(np.prod(things[row].size)) for row in within)
-    return within if len(within) > 1 and is_larger else []
+    things: Sequence[Followed], blobs: Sequence[Blob], found: dict[int, int]
+) -> dict[int, list[int]]:
+    """The things (rows) that each blob (column) shows together, where there are several."""
+    if not things or not blobs:
+        return {}
+    boxes = np.stack([thing.box for thing in things])
+    is_inside = overlaps(boxes, np.stack([blob.box for blob in blobs]))[1] >= _SHARED_INSIDE
+    shared: dict[int, list[int]] = {}
+    for column in np.flatnonzero(np.count_nonzero(is_inside, axis=0) > 1).tolist():
+        within = [
+            row
+            for row in np.flatnonzero(is_inside[:, column]).tolist()
+            if things[row].life is not Life.NEW
+            and (things[row].life is not Life.LOST or found.get(row) == column)
+            and found.get(row, column) == column
+        ]
+        least = _SHARED_LARGER * max((float(np.prod(things[r].size)) for r in within), default=0.0)
+        if len(within) > 1 and float(np.prod(blobs[column].size)) > least:
+            shared[column] = within
+    return shared

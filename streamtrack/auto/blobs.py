@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
@@ -12,8 +13,8 @@ import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.auto.background import Outstanding
-from streamtrack.auto.boxes import HasBox, box_around
-from streamtrack.types import Image, Mask
+from streamtrack.auto.boxes import HasBox, box_around, moved_point
+from streamtrack.types import Image, Mask, Matrix
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
@@ -25,7 +26,7 @@ _CLOSING_PX = 3
 _SHADE_CLOSING_PX = 9
 _MOST_BLOBS = 80
 _FASTEST_PX = 14.0  # grid pixels a frame that flow still measures
-_BINS = 4
+_BINS = 4  # a channel
 _FRAGMENT_GAP_PX = 5.0  # grid pixels
 _FRAGMENT_SHARE = 0.3  # of the area of the thing it belongs to
 _ALIKE_PX = 0.8  # grid pixels a frame, between motions of parts of one thing
@@ -56,14 +57,23 @@ class Scene:
     """What moves in one frame: the blobs, the pixels (h, w) they consist of, and the motion there.
 
     ``motion`` (h, w, 2) are grid pixels since the frame before, None if that is not known;
-    ``grey`` (h, w) is the frame in the grid.
+    ``image`` (h, w, 3) is the frame in the grid.
     """
 
     blobs: tuple[Blob, ...]
     solid: Mask
     motion: npt.NDArray[np.float32] | None
-    grey: Image
+    image: Image
     grid_from_frame: Doubles
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Look:
+    """What blobs are described by: `color_bins` (h, w), motion (h, w, 2), frame_from_grid."""
+
+    colors: Image
+    motion: npt.NDArray[np.float32] | None
+    frame_from_grid: Matrix
 
 
 class MotionField:
@@ -100,36 +110,44 @@ def find_blobs(
         is_kept = (areas >= _LEAST_PIXELS) & (clear_counts >= _LEAST_CLEAR)
         is_kept[0] = False
         kept = np.flatnonzero(is_kept)
+        look = _Look(
+            color_bins(outstanding.image), motion, geometry.inverted(outstanding.grid_from_frame)
+        )
         for part in kept[np.argsort(-areas[kept])][:_MOST_BLOBS]:
-            x, y, width, height = stats[part, :4]
+            x, y, width, height = stats[part, :4].tolist()
             window = slice(y, y + height), slice(x, x + width)
             inside = parts[window] == part
             for piece in [inside] if motion is None else _split(inside, motion[window]):
                 solid[window] |= piece
-                blobs.append(_blob(piece, window, outstanding, motion))
+                blobs.append(_blob(piece, window, look))
     blobs = _with_fragments(blobs, frame_px(outstanding))
-    return Scene(tuple(blobs), solid, motion, outstanding.grey, outstanding.grid_from_frame)
+    return Scene(tuple(blobs), solid, motion, outstanding.image, outstanding.grid_from_frame)
 
 
 def _with_fragments(blobs: list[Blob], grid_px: float) -> list[Blob]:
     """The blobs, the small ones made part of a larger one beside them that moves alike."""
-    kept: list[Blob] = []
-    for blob in sorted(blobs, key=lambda blob: -float(np.prod(blob.size))):
-        for row, larger in enumerate(kept):
-            if _is_fragment(blob, larger, grid_px):
-                kept[row] = united_blob([larger, blob])
-                break
+    if len(blobs) < 2:
+        return blobs
+    blobs = sorted(blobs, key=lambda blob: -float(np.prod(blob.size)))
+    boxes = np.stack([blob.box for blob in blobs])
+    motions = np.stack([blob.motion for blob in blobs])
+    gaps = (boxes[:, None, :2] - boxes[None, :, 2:]).max(axis=2)
+    apart = np.linalg.norm(motions[:, None] - motions[None], axis=2)
+    is_alike = apart < _ALIKE_PX * grid_px
+    may_belong = is_alike & (np.maximum(gaps, gaps.T) <= _FRAGMENT_GAP_PX * grid_px)
+    kept: dict[int, Blob] = {}
+    for index, blob in enumerate(blobs):
+        beside = [row for row in np.flatnonzero(may_belong[index, :index]).tolist() if row in kept]
+        whole = next((row for row in beside if _is_fragment(blob, kept[row])), None)
+        if whole is None:
+            kept[index] = blob
         else:
-            kept.append(blob)
-    return kept
+            kept[whole] = united_blob([kept[whole], blob])
+    return list(kept.values())
 
 
-def _is_fragment(blob: Blob, larger: Blob, grid_px: float) -> bool:
-    gap = np.maximum(blob.box[:2] - larger.box[2:], larger.box[:2] - blob.box[2:]).max()
-    if gap > _FRAGMENT_GAP_PX * grid_px:
-        return False
-    if not float(np.hypot(*(blob.motion - larger.motion))) < _ALIKE_PX * grid_px:
-        return False
+def _is_fragment(blob: Blob, larger: Blob) -> bool:
+    """Is a blob a part of a larger one beside it that moves alike?"""
     sides = np.minimum(blob.box[2:], larger.box[2:]) - np.maximum(blob.box[:2], larger.box[:2])
     area = float(np.prod(blob.size))
     is_inside = bool((sides > 0).all()) and float(np.prod(sides)) > 0.5 * area
@@ -169,17 +187,20 @@ def _ellipse(side_px: int) -> Image:
 
 def _split(inside: Mask, motion: npt.NDArray[np.float32]) -> list[Mask]:
     """Two parts if the pixels move in two ways that keep apart, in the picture too."""
-    rows, columns = np.nonzero(inside)
-    if len(rows) < _SPLIT_PIXELS:
+    deviations = cv2.meanStdDev(motion, mask=inside.view(np.uint8))[1]
+    if float(np.hypot(*deviations.ravel())) < 0.5 * _SPLIT_PX:
         return [inside]
-    moved = motion[rows, columns].astype(np.float64)
+    moved = motion[inside].astype(np.float64)
+    if len(moved) < _SPLIT_PIXELS:
+        return [inside]
     middle = moved.mean(axis=0)
     spread = moved - middle
-    covariance = spread.T @ spread / len(moved)
-    values, axes = np.linalg.eigh(covariance)
-    if np.sqrt(values[1]) < 0.5 * _SPLIT_PX:
+    (xx, xy), (_, yy) = (spread.T @ spread / len(moved)).tolist()
+    largest_variance = 0.5 * (xx + yy + math.hypot(xx - yy, 2 * xy))
+    if largest_variance < (0.5 * _SPLIT_PX) ** 2:
         return [inside]
-    along = spread @ axes[:, 1]
+    turn = 0.5 * math.atan2(2 * xy, xx - yy)
+    along = spread @ np.array([math.cos(turn), math.sin(turn)])
     cut, low, high = 0.0, along, along
     for _ in range(4):  # two means along the main axis of the motions
         low, high = along[along < cut], along[along >= cut]
@@ -192,10 +213,10 @@ def _split(inside: Mask, motion: npt.NDArray[np.float32]) -> list[Mask]:
     if apart < max(_SPLIT_PX, _SPLIT_SPEED_SHARE * speed) or within > _TIGHT * apart:
         return [inside]
     is_high = np.zeros_like(inside)
-    is_high[rows, columns] = along >= cut
+    is_high[inside] = along >= cut
     is_high = (cv2.medianBlur(is_high.astype(np.uint8), 5) > 0) & inside
     parts = [_largest(is_high), _largest(inside & ~is_high)]
-    if min(np.count_nonzero(part) for part in parts) < _SPLIT_SHARE * len(rows):
+    if min(np.count_nonzero(part) for part in parts) < _SPLIT_SHARE * len(moved):
         return [inside]
     return parts
 
@@ -208,37 +229,23 @@ def _largest(mask: Mask) -> Mask:
     return largest
 
 
-def _blob(
-    piece: Mask,
-    window: tuple[slice, slice],
-    outstanding: Outstanding,
-    motion: npt.NDArray[np.float32] | None,
-) -> Blob:
-    rows, columns = np.flatnonzero(piece.any(axis=1)), np.flatnonzero(piece.any(axis=0))
-    y, x = window[0].start, window[1].start
-    low = np.array([x + columns[0] - 0.5, y + rows[0] - 0.5])
-    high = np.array([x + columns[-1] + 0.5, y + rows[-1] + 0.5])
-    box, scale = frame_box(low, high, outstanding.grid_from_frame)
+def _blob(piece: Mask, window: tuple[slice, slice], look: _Look) -> Blob:
+    x, y, width, height = cv2.boundingRect(piece.view(np.uint8))
+    low = np.array([window[1].start + x - 0.5, window[0].start + y - 0.5])
+    size = np.array([width, height], np.float64)
+    center, scale = moved_point(look.frame_from_grid, low + 0.5 * size)
+    box = box_around(center, scale * size)
     moved = np.full(2, np.nan)
-    if motion is not None:
-        middle = np.median(motion[window][piece], axis=0).astype(np.float64)
+    if look.motion is not None:
+        moves = look.motion[window][piece]
+        middle = np.partition(moves, len(moves) // 2, axis=0)[len(moves) // 2].astype(np.float64)
         if np.abs(middle).max() <= _FASTEST_PX:
             moved = middle * scale
-    return Blob(box, moved, color_histogram(outstanding.image[window], piece))
+    counts = np.bincount(look.colors[window][piece], minlength=_BINS**3)
+    return Blob(box, moved, counts / max(1, int(counts.sum())))
 
 
-def frame_box(low: Doubles, high: Doubles, grid_from_frame: Doubles) -> tuple[Doubles, float]:
-    """An upright box of the grid as one of the frame: x0, y0, x1, y1, and frame px a grid px."""
-    frame_from_grid = geometry.inverted(grid_from_frame)
-    center = 0.5 * (low + high)
-    scale = geometry.local_scale(frame_from_grid, center)
-    middle = geometry.transform_points(frame_from_grid, center)[0].astype(np.float64)
-    return box_around(middle, scale * (high - low)), scale
-
-
-def color_histogram(image: Image, mask: Mask) -> Doubles:
-    """Shares (64,) of the colours of the pixels of ``image`` (h, w, 3) under a mask."""
-    bins = (image[mask] >> 6).astype(np.intp)
-    index = bins[:, 0] * _BINS * _BINS + bins[:, 1] * _BINS + bins[:, 2]
-    counts = np.bincount(index, minlength=_BINS**3).astype(np.float64)
-    return np.asarray(counts / max(1.0, counts.sum()), np.float64)
+def color_bins(image: Image) -> Image:
+    """Which of the 64 colours each pixel (h, w) of a picture (h, w, 3) has."""
+    blue, green, red = (np.asarray(channel, np.uint8) >> 6 for channel in cv2.split(image))
+    return np.asarray((blue << 4) | (green << 2) | red, np.uint8)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TypeAlias
 
 import numpy as np
@@ -13,6 +14,7 @@ from streamtrack.types import Matrix, Size
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
 _EDGE_PX = 3.0
+_LEAST_DEPTH = 1e-20
 
 
 class HasBox:
@@ -36,10 +38,16 @@ def box_around(center: Doubles, size: Doubles) -> Doubles:
 
 def moved_point(b_from_a: Matrix, point: Doubles) -> tuple[Doubles, float]:
     """A point (2,) in the other picture, and how much larger things are there."""
-    moved = geometry.transform_points(b_from_a, point)[0].astype(np.float64)
-    if not np.isfinite(moved).all():
+    row_x, row_y, row_depth = b_from_a.tolist()
+    x, y = point.tolist()
+    depth = row_depth[0] * x + row_depth[1] * y + row_depth[2]
+    if abs(depth) < _LEAST_DEPTH:
         return point, 1.0
-    return moved, float(np.clip(geometry.local_scale(b_from_a, point), 0.5, 2.0))
+    moved_x, moved_y = ((row[0] * x + row[1] * y + row[2]) / depth for row in (row_x, row_y))
+    if not (math.isfinite(moved_x) and math.isfinite(moved_y)):
+        return point, 1.0
+    scale = min(max(geometry.local_scale(b_from_a, point), 0.5), 2.0)
+    return np.array([moved_x, moved_y]), scale
 
 
 def moved_box(b_from_a: Matrix, box: Doubles) -> Doubles:

@@ -61,6 +61,9 @@ class Followed(HasBox):
     still: int = 0
     ends: FreeEnds = field(default_factory=FreeEnds)
     likeness: Likeness | None = None
+    touches: bool = False
+    alone: int = 0
+    guessed: int = 0
     reason: str = ""
 
     @classmethod
@@ -116,11 +119,11 @@ class Followed(HasBox):
         self.path_px += float(np.hypot(*(self.center - before)))
         self.colors = self.colors + _COLOR_RATE * (blob.colors - self.colors)
         self.hits += 1
-        self.misses = 0
+        self.misses = self.guessed = 0
 
     def resume(self, life: Life) -> None:
         """It was met with again; what has no name yet stays new."""
-        if self.life is not Life.NEW:
+        if self.life not in (Life.NEW, Life.OVER):
             self.life, self.lost_s, self.reason = life, 0.0, ""
 
     def note_rest(self, least_px: float, step_s: float) -> None:

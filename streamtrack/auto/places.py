@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import cv2
@@ -13,13 +14,22 @@ from streamtrack import geometry
 from streamtrack.auto.background import Outstanding
 from streamtrack.auto.blobs import Scene
 from streamtrack.frame_view import FrameView
-from streamtrack.types import Image, Mask, Matrix, Track
+from streamtrack.types import Image, Mask, Matrix, Points, Size, Track
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
 _WIDTH_PX = 320
 REST_PX = 0.4  # grid pixels a frame, below which something stands
 _CHANGE_FACTOR = 4.0  # of the noise, by which a pixel differs from the frame before
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """Seconds since the frame before, frame pixels a grid pixel, and the frame's size."""
+
+    step_s: float
+    grid_px: float
+    size_wh: Size
 
 
 def reduced(view: FrameView) -> tuple[Image, Matrix]:
@@ -62,18 +72,24 @@ def moving_pixels(seen: Outstanding, motion: npt.NDArray[np.float32] | None) -> 
 
 def hidden_by(seen: Outstanding, given: Sequence[Track]) -> Mask:
     """The places of the targets that were given."""
-    mask = np.zeros(seen.clear.shape, np.uint8)
+    quads = []
     for track in given:
         if track.quad is not None and np.isfinite(track.quad).all():
             middle = track.quad.mean(axis=0)
-            fill(mask, middle + np.float32(1.15) * (track.quad - middle), seen.grid_from_frame, 1)
+            quads.append(middle + np.float32(1.15) * (track.quad - middle))
+    return filled(quads, seen.grid_from_frame, seen.clear.shape)
+
+
+def filled(quads: Sequence[Points], grid_from_frame: Matrix, shape: tuple[int, ...]) -> Mask:
+    """Which pixels (h, w) of the grid lie in quads (4, 2) of the frame."""
+    mask = np.zeros(shape, np.uint8)
+    if not quads:
+        return mask > 0
+    corners = geometry.transform_points(grid_from_frame, np.concatenate(quads)).reshape(-1, 4, 2)
+    corners = corners[np.isfinite(corners).all(axis=(1, 2))]
+    for outline in np.rint(np.clip(corners, -1e5, 1e5)).astype(np.int32):
+        cv2.fillConvexPoly(mask, outline, 1)
     return mask > 0
-
-
-def fill(mask: Image, quad: npt.NDArray[np.float32], grid_from_frame: Matrix, value: int) -> None:
-    outline = geometry.transform_points(grid_from_frame, quad)
-    if np.isfinite(outline).all():
-        cv2.fillConvexPoly(mask, np.rint(np.clip(outline, -1e5, 1e5)).astype(np.int32), value)
 
 
 def motion_within(scene: Scene, box: Doubles) -> tuple[Doubles, float] | None:

@@ -9,25 +9,33 @@ a place, and is taken up again under its name if it reappears in time; one that 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.auto.association import associate
+from streamtrack.auto.association import associate, found_again
 from streamtrack.auto.background import BackgroundModel, Outstanding
 from streamtrack.auto.blobs import Blob, MotionField, Scene, find_blobs, frame_px
-from streamtrack.auto.boxes import box_around, overlap, touched_edges
+from streamtrack.auto.boxes import overlap, touched_edges
+from streamtrack.auto.contact import (
+    carry,
+    end_duplicates,
+    hold_to_edges,
+    is_whole,
+    note_contacts,
+    own_things,
+    portray,
+    sight,
+)
 from streamtrack.auto.followed import Followed, Life
-from streamtrack.auto.likeness import Likeness
 from streamtrack.auto.places import (
     REST_PX,
-    fill,
+    Moment,
+    filled,
     hidden_by,
     is_invertible,
-    motion_within,
     moving_pixels,
     reduced,
 )
@@ -58,25 +66,10 @@ _COAST_S = 2.0
 _SLOWER_AFTER_S = 0.5  # lost, until which it is thought to go on as fast
 _MOST_TARGETS = 60
 _BROKEN_FRAMES = 5  # in a row, after which the scene is another one
-_DUPLICATE_OVERLAP = 0.75
-_CARRYING_SHARE = 0.3  # of a thing's place that must stand out for it to be carried
-_WHOLE = 0.85, 1.18  # size of what is found against its own, while it is seen whole
-_CORE_SHARE = 0.75
 _REACH_PX = 4.0  # grid pixels, beyond which nothing is found again
-_ELDER_HITS = 10  # sightings of its own that make it a thing of its own
-_ALIKE_PX = 0.8  # grid pixels a frame, between motions of parts of one thing
 _REST_FRAMES = 8
 _USUAL_STEP_S = 0.04
 _MAX_STEP_S = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class _Moment:
-    """Seconds since the frame before, frame pixels a grid pixel, and the frame's size."""
-
-    step_s: float
-    grid_px: float
-    size_wh: Size
 
 
 class AutoTargets:
@@ -132,11 +125,11 @@ class AutoTargets:
         seen = self._background.with_young(seen, changing)
         scene = find_blobs(seen, hidden_by(seen, given), motion)
         self.blobs = scene.blobs
-        moment = _Moment(step_s, frame_px(seen), view.size_wh)
+        moment = Moment(step_s, frame_px(seen), view.size_wh)
         self._associate(scene, moment)
         self._background.learn(seen, moving, self._protected(seen))
         self._confirm(self._background, scene, moment)
-        self._drop_duplicates(moment)
+        end_duplicates(self._things, moment)
         self._end_left_places(self._background, scene, moment)
         return self._tracks()
 
@@ -160,31 +153,34 @@ class AutoTargets:
                 thing.predict(frame_from_before, time_s)
         self._world_from_before = world_from_frame
 
-    def _associate(self, scene: Scene, moment: _Moment) -> None:
-        reach_px = _REACH_PX * moment.grid_px
-        found = associate(self._things, scene.blobs, reach_px)
+    def _associate(self, scene: Scene, moment: Moment) -> None:
+        note_contacts(self._things, moment)
+        met = [t for t in self._things if t.touches and sight(t, scene, moment)]
+        found = associate(self._things, scene.blobs, _REACH_PX * moment.grid_px)
         pairs = list(found.pairs)
-        carried: list[Followed] = []
         for things, blob in found.shared:
-            own = _own_things(things, moment)
+            own = own_things(things, moment)
             for fragment in things:
                 if not any(fragment is thing for thing in own):
                     fragment.life = Life.OVER
             if len(own) == 1:
                 pairs.append((own[0], blob))
                 continue
-            for thing in own:
-                _carry(thing, scene, moment)
+            unsighted = [thing for thing in own if thing not in met]
+            for thing in unsighted:
+                carry(thing, scene, moment)
                 thing.resume(Life.CARRIED)
-            _hold_to_edges(own, blob)
-            carried += own
+            hold_to_edges(own, blob)
+            met += unsighted
         for thing, blob in pairs:
+            if thing in met and not is_whole(thing, blob):
+                continue  # a part of it, where its place is known better
+            met.append(thing)
             thing.take(blob, moment.step_s, moment.size_wh)
             thing.resume(Life.SEEN)
-            _portray(thing, blob, scene)
-        met = {id(thing) for thing in [*(thing for thing, _ in pairs), *carried]}
+            portray(thing, blob, scene)
         for thing in self._things:
-            if id(thing) not in met:
+            if thing not in met:
                 self._miss(thing, scene, moment)
         self._things = [thing for thing in self._things if not _is_over(thing, moment.size_wh)]
         self._things += [
@@ -193,19 +189,21 @@ class AutoTargets:
             if not self._is_claimed(blob)
         ]
 
-    def _miss(self, thing: Followed, scene: Scene, moment: _Moment) -> None:
+    def _miss(self, thing: Followed, scene: Scene, moment: Moment) -> None:
         """It was found nowhere: its pixels may still show it, else it is lost."""
         thing.misses += 1
         if thing.life in (Life.NEW, Life.OVER):
             return
-        if thing.life is not Life.LOST and _carry(thing, scene, moment) >= _CARRYING_SHARE:
+        if thing.life is not Life.LOST and (
+            sight(thing, scene, moment) or carry(thing, scene, moment)
+        ):
             thing.life = Life.CARRIED
             return
         thing.life = Life.LOST
         thing.lost_s += moment.step_s
         thing.reason = "hidden, or no longer told from the background"
 
-    def _end_left_places(self, background: BackgroundModel, scene: Scene, moment: _Moment) -> None:
+    def _end_left_places(self, background: BackgroundModel, scene: Scene, moment: Moment) -> None:
         """End what only marks the place that something left, and heal the background there."""
         for thing in self._things:
             if thing.life not in (Life.SEEN, Life.CARRIED):
@@ -222,7 +220,7 @@ class AutoTargets:
             if thing.life in (Life.SEEN, Life.CARRIED)
         )
 
-    def _confirm(self, background: BackgroundModel, scene: Scene, moment: _Moment) -> None:
+    def _confirm(self, background: BackgroundModel, scene: Scene, moment: Moment) -> None:
         """Name the things that have been seen often enough and have moved."""
         least = max(_LEAST_HITS, round(_CONFIRMED_S / self._step_s))
         named = sum(thing.life is not Life.NEW for thing in self._things)
@@ -233,8 +231,15 @@ class AutoTargets:
                 continue
             if _end_left_place(thing, background, scene):
                 continue
-            thing.life, thing.name, named = Life.SEEN, self._next_name(), named + 1
-            thing.home = thing.box.copy()
+            before = found_again(thing, self._things, _REACH_PX * moment.grid_px)
+            if before is not None:
+                before.life = Life.OVER
+                thing.name, thing.home = before.name, before.home
+            else:
+                thing.name, thing.home = self._next_name(), thing.box.copy()
+                named += 1
+            thing.life = Life.SEEN
+        self._things = [thing for thing in self._things if thing.life is not Life.OVER]
 
     def _next_name(self) -> str:
         while True:
@@ -243,27 +248,10 @@ class AutoTargets:
             if name not in self._taken:
                 return name
 
-    def _drop_duplicates(self, moment: _Moment) -> None:
-        """Of two things at one place, moving alike, the one that was seen for longer is right."""
-        named = [thing for thing in self._things if thing.life in (Life.SEEN, Life.CARRIED)]
-        named.sort(key=lambda thing: -thing.hits)
-        for index, thing in enumerate(named):
-            for younger in named[index + 1 :]:
-                common, inside = overlap(younger.box, thing.box)
-                is_same = common > _DUPLICATE_OVERLAP or (
-                    inside > _DUPLICATE_OVERLAP and _is_alike(thing, younger, moment)
-                )
-                if is_same:
-                    younger.life = Life.OVER
-        self._things = [thing for thing in self._things if thing.life is not Life.OVER]
-
     def _protected(self, seen: Outstanding) -> Mask:
         """Where targets are: there the background learns nothing."""
-        mask = np.zeros(seen.clear.shape, np.uint8)
-        for thing in self._things:
-            if thing.life in (Life.SEEN, Life.CARRIED):
-                fill(mask, thing.quad, seen.grid_from_frame, 1)
-        return mask > 0
+        there = [t.quad for t in self._things if t.life in (Life.SEEN, Life.CARRIED)]
+        return filled(there, seen.grid_from_frame, seen.clear.shape)
 
     def _blind(self, reason: str) -> list[Track]:
         """A frame in which nothing can be seen: the targets are lost, or end."""
@@ -319,64 +307,12 @@ class AutoTargets:
 
 def _end_left_place(thing: Followed, background: BackgroundModel, scene: Scene) -> bool:
     """End a thing if it only marks the place that something left, and heal the background."""
-    place = np.zeros(scene.solid.shape, np.uint8)
-    fill(place, thing.quad, scene.grid_from_frame, 1)
-    there = (place > 0) & scene.solid
+    there = filled([thing.quad], scene.grid_from_frame, scene.solid.shape) & scene.solid
     if not background.has_left(there):
         return False
     background.heal(there)
     thing.life = Life.OVER
     return True
-
-
-def _own_things(things: Sequence[Followed], moment: _Moment) -> list[Followed]:
-    """Of things that share a blob those that are no fragments of the others.
-
-    Fragments were hardly ever seen alone, and move as the rest does.
-    """
-    elders = [thing for thing in things if thing.hits >= _ELDER_HITS]
-    first = max(things, key=lambda thing: thing.hits)
-    others = [
-        thing for thing in things if thing not in elders and not _is_alike(thing, first, moment)
-    ]
-    return [*(elders or [first]), *(thing for thing in others if thing is not first)]
-
-
-def _is_alike(one: Followed, other: Followed, moment: _Moment) -> bool:
-    """Do two things move as parts of one would?"""
-    apart = float(np.hypot(*(one.velocity - other.velocity))) * moment.step_s
-    return apart <= _ALIKE_PX * moment.grid_px
-
-
-def _carry(thing: Followed, scene: Scene, moment: _Moment) -> float:
-    """Move a thing as its own picture does, or else the pixels in its place; how much shows it."""
-    if thing.likeness is not None:
-        beside = thing.likeness.find(scene.grey, _core(thing, scene))
-        if beside is not None:
-            moved = thing.velocity * moment.step_s + beside * moment.grid_px
-            thing.carry(moved, moment.step_s)
-            return 1.0
-    found = motion_within(scene, thing.box)
-    if found is None:
-        return 0.0
-    moved, share = found
-    if share >= _CARRYING_SHARE:
-        thing.carry(moved, moment.step_s)
-    return share
-
-
-def _portray(thing: Followed, blob: Blob, scene: Scene) -> None:
-    """Keep a picture of a thing that is seen alone and whole."""
-    ratio = blob.size / np.maximum(thing.size, 1e-6)
-    if thing.life is Life.SEEN and (ratio > _WHOLE[0]).all() and (ratio < _WHOLE[1]).all():
-        taken = Likeness.taken(scene.grey, _core(thing, scene))
-        thing.likeness = taken or thing.likeness
-
-
-def _core(thing: Followed, scene: Scene) -> Doubles:
-    """The inner part of a thing's box, in the grid: what lies around it does not belong to it."""
-    core = box_around(thing.center, _CORE_SHARE * thing.size).reshape(2, 2)
-    return geometry.transform_points(scene.grid_from_frame, core).astype(np.float64).ravel()
 
 
 def _is_over(thing: Followed, size_wh: Size) -> bool:
@@ -389,17 +325,6 @@ def _is_over(thing: Followed, size_wh: Size) -> bool:
     edges = touched_edges(thing.box, size_wh)
     outward = np.concatenate([thing.velocity < 0, thing.velocity > 0])
     return is_outside or bool((edges & outward).any()) or thing.lost_s > _COAST_S
-
-
-def _hold_to_edges(things: Sequence[Followed], blob: Blob) -> None:
-    """Shift the outermost things of a shared blob so that they end where it ends."""
-    for axis in (0, 1):
-        first = min(things, key=lambda thing: float(thing.box[axis]))
-        last = max(things, key=lambda thing: float(thing.box[axis + 2]))
-        for thing, edge in ((first, axis), (last, axis + 2)):
-            off = float(blob.box[edge] - thing.box[edge])
-            if abs(off) <= 0.25 * float(thing.size[axis]):
-                thing.box[[axis, axis + 2]] += 0.3 * off
 
 
 def _has_moved(thing: Followed, frame_px: float) -> bool:

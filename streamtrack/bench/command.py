@@ -28,8 +28,7 @@ from streamtrack.errors import StreamtrackError, UsageError
 from streamtrack.outputs import output_error, write_file
 
 _NO_SCENES = "none"
-_SEEDS = "1,2,3"
-_QUICK_SEEDS = "1"
+_SEEDS = "1"
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +84,7 @@ def _scenarios(request: Request) -> list[Scenario]:
     scenes = _names(request.scenes)
     result: list[Scenario] = []
     if scenes != [_NO_SCENES]:
-        usual = _QUICK_SEEDS if request.is_quick else _SEEDS
-        seeds = parse_seeds(usual if request.seeds is None else request.seeds)
+        seeds = parse_seeds(_SEEDS if request.seeds is None else request.seeds)
         result += synthetic_scenarios(scenes, seeds, request.frames, is_quick=request.is_quick)
     elif request.pot is None:
         raise UsageError("--scenes none leaves nothing to do: add --pot FOLDER")

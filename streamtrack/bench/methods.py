@@ -107,10 +107,7 @@ _ALL = (
     Method("kcf", "KCF, box", peers.kcf, {"parameters": "OpenCV's defaults"}, is_box=True),
 )
 METHODS: Mapping[str, Method] = {method.name: method for method in _ALL}
-QUICK_METHODS = (
-    *("streamtrack", "harris-freak", "plane-tracker"),
-    *("lk-chain", "prewarp-lk", "prewarp-dis"),
-)
+QUICK_METHODS = ("streamtrack", "plane-tracker", "lk-chain", "prewarp-lk")
 
 
 def choose_methods(names: Sequence[str]) -> list[Method]:

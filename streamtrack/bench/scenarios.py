@@ -1,9 +1,9 @@
 """The benchmark's sequences: pictures with the target's true corners in each.
 
-Synthetic ones run over scenes and seeds. Of the seeds of a scene about every fourth sequence is
-1280x720, the others 640x480, and every second shows a photograph where scikit-image is installed
-(only what lies in its package; nothing is fetched), the others a painted texture. A sequence is
-held in memory as a whole.
+Synthetic ones run over scenes and seeds, one seed unless more are asked for. Of the seeds of a
+scene about every fourth sequence is 1280x720, the others 640x480, and every second shows a
+photograph where scikit-image is installed (only what lies in its package; nothing is fetched), the
+others a painted texture. A sequence is held in memory as a whole.
 
 Scored are frames with at least a fifth of the target visible, except the first, in which it is
 given; POT sequences as POT says: annotated, flag 0, and not the first annotated one.
@@ -41,19 +41,22 @@ _PHOTOS = (
     *("astronaut.png", "chelsea.png", "coffee.png", "camera.png"),
     *("rocket.jpg", "motorcycle_left.png"),
 )
-FRAMES = 150
+FRAMES = {
+    **dict.fromkeys(SCENES, 60),
+    **dict.fromkeys(("occlusion", "outofview", "unconstrained", "absence"), 150),
+    "fullocclusion": 120,
+}
 """Enough for every scene to show what it is made for: in ``absence`` the target is back at 130."""
 QUICK_FRAMES = {
-    "scale": 60,
-    "perspective": 50,
-    "blur": 40,
-    "unconstrained": 90,
+    "scale": 40,
+    "perspective": 40,
+    "blur": 30,
+    "unconstrained": 75,
     "absence": 135,
-    "fullocclusion": 105,
-    "weak": 40,
-    "small": 40,
-    "fast": 40,
-    "static": 30,
+    "weak": 25,
+    "small": 25,
+    "fast": 25,
+    "static": 25,
 }
 MIN_VISIBLE = 0.2
 ABSENT_BELOW = 0.02
@@ -204,11 +207,11 @@ def synthetic_scenarios(
     for scene in chosen:
         if scene not in SCENES:
             raise unknown_name("scene", scene, SCENES)
-    usual = QUICK_FRAMES if is_quick else {}
+    usual = {**FRAMES, **QUICK_FRAMES} if is_quick else FRAMES
     result: list[Scenario] = []
     for scene in dict.fromkeys(chosen):
         for seed in dict.fromkeys(seeds):
-            count = frames or usual.get(scene, FRAMES)
+            count = frames or usual[scene]
             size = (640, 480) if is_quick else _size(scene, seed)
             result.append(SyntheticScenario(scene, seed, size, count, _photo(scene, seed)))
     return result

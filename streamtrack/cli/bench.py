@@ -19,13 +19,21 @@ bench_app = typer.Typer(
 @bench_app.command("track")
 def bench_track(
     quick: Annotated[
-        bool, typer.Option("--quick", help="A reduced set, in about a minute.")
+        bool,
+        typer.Option(
+            "--quick",
+            help="9 scenes at 640x480, streamtrack, plane-tracker, lk-chain and prewarp-lk: about "
+            "a minute.",
+        ),
     ] = False,
     scenes: Annotated[
         str | None,
         typer.Option(help="Scenes of synthetic://, as blur,static; none for --pot alone."),
     ] = None,
-    seeds: Annotated[str | None, typer.Option(help="Seeds of each scene; default 1,2,3.")] = None,
+    seeds: Annotated[
+        str | None,
+        typer.Option(help="Seeds of each scene, as 1,2,3; default 1. The time grows with them."),
+    ] = None,
     methods: Annotated[
         str | None,
         typer.Option(
@@ -34,7 +42,7 @@ def bench_track(
         ),
     ] = None,
     frames: Annotated[
-        int | None, typer.Option(min=3, help="Frames of each sequence; default 150.")
+        int | None, typer.Option(min=3, help="Frames of each sequence; default 60 to 150.")
     ] = None,
     pot: Annotated[
         Path | None, typer.Option(help="Folder of POT sequences, to be run as well.")
@@ -48,7 +56,11 @@ def bench_track(
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Tell no progress.")] = False,
 ) -> None:
-    """Track sequences with known truth by streamtrack and its peers, on the very same frames."""
+    """Track sequences with known truth by streamtrack and its peers, on the very same frames.
+
+    Without options 17 sequences, one of each scene, 13 of 640x480 and 4 of 1280x720, 1440 frames in
+    all: about a quarter of an hour for all methods, two minutes for --methods streamtrack alone.
+    """
     from streamtrack.bench.command import Request, run_request, tell_on
 
     console, errors = consoles()

@@ -24,6 +24,7 @@ from streamtrack.cli.common import (
 )
 from streamtrack.cli.plain import plain_summary, stage_progress_for, warnings_on_stderr
 from streamtrack.errors import UsageError
+from streamtrack.sources.addresses import path_of
 
 if TYPE_CHECKING:
     from streamtrack.recording.live_server import LiveAddress
@@ -35,6 +36,7 @@ def mosaic(
         list[str],
         typer.Argument(
             metavar="INPUT...",
+            parser=path_of,
             help="Pictures, folders or globs of them; or one stream: video file, /dev/videoN, "
             "rtsp://..., synthetic://...",
         ),

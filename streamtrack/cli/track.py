@@ -27,6 +27,7 @@ from streamtrack.cli.common import (
     warnings_shown,
 )
 from streamtrack.errors import UsageError
+from streamtrack.sources.addresses import path_of
 
 
 def track(
@@ -34,6 +35,7 @@ def track(
         str,
         typer.Argument(
             metavar="SOURCE",
+            parser=path_of,
             help="Video file, folder or glob of pictures, /dev/videoN (see streamtrack devices), "
             "v4l2://, rtsp://, http(s)://, udp://, - for standard input, or "
             "synthetic://SCENE?seed=1&frames=300.",
@@ -54,8 +56,11 @@ def track(
         float | None,
         typer.Option(
             metavar="MS",
-            help="Keep the time a frame near MS by doing less, in four stated levels; of a live "
-            "source from when the frame lay ready. Results then depend on the machine's speed.",
+            help="Keep the time a frame near MS by doing less, in four levels: all; half the area "
+            "and features; a third of the features, lost targets searched for in every second "
+            "frame; a quarter, every fourth. Of a live source it counts from when the frame lay "
+            "ready. The summary says how often it was exceeded. Results then depend on the "
+            "machine's speed.",
         ),
     ] = None,
     camera: Annotated[

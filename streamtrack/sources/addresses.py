@@ -57,6 +57,14 @@ def kind_of(address: str) -> AddressKind:
     return AddressKind.NETWORK if scheme in NETWORK_SCHEMES else AddressKind.UNKNOWN
 
 
+def path_of(address: str) -> str:
+    """The path behind a ``file://`` address of this machine (RFC 8089); all else as it is."""
+    for start in ("file:///", "file://localhost/"):
+        if address.lower().startswith(start):
+            return "/" + unquote(address[len(start) :])
+    return address
+
+
 def is_live(address: str) -> bool:
     """True for what is read as a live stream: cameras, network addresses and ``-``."""
     return kind_of(address) in (AddressKind.CAMERA, AddressKind.NETWORK, AddressKind.STDIN)

@@ -25,6 +25,7 @@ from streamtrack.geometry import (
     transform_points,
 )
 from streamtrack.types import Image, Mask, Matrix, Model, Points
+from streamtrack.uncertainty import MODEL_BASES, motion_rows
 
 Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
@@ -38,22 +39,6 @@ _ROUNDS = 4
 _CONVERGED_PX = 0.04  # patch pixels
 _MAX_MOVE_SHARE = 0.1
 _SAMPLE_STEP = 4
-
-_BASES = {
-    Model.TRANSLATION: np.eye(8)[:, [2, 5]],
-    Model.SIMILARITY: np.stack(
-        [
-            np.eye(8)[2],
-            np.eye(8)[5],
-            np.eye(8)[0] + np.eye(8)[4],
-            np.eye(8)[3] - np.eye(8)[1],
-        ],
-        axis=1,
-    ),
-    Model.AFFINE: np.eye(8)[:, :6],
-    Model.HOMOGRAPHY: np.eye(8),
-}
-"""Columns: the directions in the homography's parameters h11 .. h32 that a model may move in."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,7 +126,7 @@ def refined(
     index, values, jacobian = gradients.index, gradients.values, gradients.jacobian
     if not support.all():
         index, values, jacobian = index[support], values[support], jacobian[support]
-    basis = _BASES[model]
+    basis = MODEL_BASES[model]
     if model is not Model.HOMOGRAPHY:
         jacobian = jacobian @ basis.astype(np.float32)
     unit_from_patch = gradients.unit_from_patch
@@ -222,7 +207,7 @@ class _Expectation:
     def gradient(self, pose: Matrix) -> Doubles:
         unit_from_frame = self.unit_from_template @ inverted(pose)
         seen = transform_points(unit_from_frame @ self.expected_pose, self.template_corners)
-        wanted = (self.corners - seen).T.ravel() * self.weight
+        wanted = (self.corners - seen).ravel() * self.weight
         gradient: Doubles = self.rows.T @ wanted
         return gradient
 
@@ -230,12 +215,8 @@ class _Expectation:
 def _expectation(prior: Prior, pose: Matrix, unit_from_template: Matrix) -> _Expectation:
     corners = transform_points(unit_from_template, prior.corners).astype(np.float64)
     frame_px = local_scale(pose @ inverted(unit_from_template), corners.mean(axis=0))
-    x, y = corners.T
-    one, zero = np.ones(4), np.zeros(4)
-    rows_x = np.stack([x, y, one, zero, zero, zero, -x * x, -x * y], axis=1)
-    rows_y = np.stack([zero, zero, zero, x, y, one, -x * y, -y * y], axis=1)
     weight = frame_px / prior.sigma_px
-    rows = np.concatenate([rows_x, rows_y]) * weight
+    rows = motion_rows(corners) * weight
     return _Expectation(
         corners, prior.corners, rows, rows.T @ rows, weight, prior.pose, unit_from_template
     )

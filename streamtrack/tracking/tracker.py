@@ -33,6 +33,11 @@ from streamtrack.tracking.appearance import (
     prepare_colors,
 )
 from streamtrack.tracking.body import Body
+from streamtrack.tracking.certainty import (
+    MAX_SIGMA_FOLLOWED_PX,
+    MAX_SIGMA_FOUND_PX,
+    are_corners_certain,
+)
 from streamtrack.tracking.flatness import Flatness
 from streamtrack.tracking.flow import FlowAligner
 from streamtrack.tracking.prediction import Prediction
@@ -417,12 +422,26 @@ class HybridTracker:
             self._doubt_px = 0.0
         self._last_share = share if means != "view" else 0.0
         self._last_seen = seen_share(alignment)
+        was_lost = self._frames_lost > 0
         self._frames_lost = self._searches = 0
         self._was_seen = True
         evidence = Evidence(alignment.template_points, alignment.frame_points, found.is_inlier)
+        # It is followed all the same: what is seen of it leads to where more of it is seen.
+        if means != "view" and not self._is_certain(evidence, found.b_from_a, was_lost):
+            found = refused(Verdict.UNCERTAIN, len(evidence), found.is_inlier)
         return make_track(
             self.template, found, evidence, means, self._was_seen, alignment.correlation
         )
+
+    def _is_certain(self, evidence: Evidence, pose: Matrix, was_lost: bool) -> bool:
+        """Do the points place the corners? More is asked of them where no motion confirms them."""
+        model, most_px = Model.HOMOGRAPHY, MAX_SIGMA_FOUND_PX
+        if not was_lost:
+            model = Model.HOMOGRAPHY if self._flatness.is_proven else Model.AFFINE
+            most_px = MAX_SIGMA_FOLLOWED_PX
+        if self._settings.registration.model != "auto":
+            model = Model(self._settings.registration.model)
+        return are_corners_certain(pose, model, evidence, self.template.quad, most_px)
 
 
 def _register_features(

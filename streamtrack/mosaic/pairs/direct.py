@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.types import Image, Matrix, Model
+from streamtrack.uncertainty import MODEL_BASES
 
 Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
@@ -31,20 +32,6 @@ _MAX_MOVE_PX = 6.0
 _MAX_MOVE_SHARE = 0.02
 _BLURS_PX = (0.8, 1.2, 1.8, 2.6, 3.6)
 _MIN_BLUR_GAIN = 0.01
-
-_E = np.eye(8)
-_BASES = {
-    Model.TRANSLATION: _E[:, [2, 5]],
-    Model.SIMILARITY: np.stack([_E[2], _E[5], _E[0] + _E[4], _E[3] - _E[1]], axis=1),
-    Model.AFFINE: _E[:, :6],
-    Model.HOMOGRAPHY: _E,
-}
-"""Columns: the directions in the homography's parameters h11 .. h32 that a model may move in."""
-
-
-def model_basis(model: Model) -> Doubles:
-    """Columns (8, k): the directions in h11 .. h32 that a model of k freedoms may move in."""
-    return _BASES[model]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +81,7 @@ def _minimised(
     near_gx, near_gy = _gradients(near)
     values, gx0, gy0 = (picture.ravel()[index] for picture in (near, near_gx, near_gy))
     far_planes = np.asarray(cv2.merge([far, *_gradients(far)]), np.float32)
-    basis = _BASES[model].astype(np.float32)
+    basis = MODEL_BASES[model].astype(np.float32)
     corners = geometry.image_quad((width, height))
     plane = np.stack([np.ones_like(u), u, v], axis=1)
     pose, moved_px = start, 0.0

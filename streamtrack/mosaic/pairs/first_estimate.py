@@ -10,6 +10,8 @@ import numpy.typing as npt
 from streamtrack.feature_pyramid import PYRAMID_STEP
 from streamtrack.fitting import fit_best_model, fit_robustly
 from streamtrack.matching import match
+from streamtrack.mosaic.pairs.standing import overlay_like, stands
+from streamtrack.mosaic.types import Picture
 from streamtrack.registration import log10_false_alarms, robust_inliers
 from streamtrack.settings import MatchingSettings, Settings
 from streamtrack.types import Features, Mask, Matches, Matrix, Model, Verdict
@@ -50,6 +52,20 @@ def estimate_by_zoom(a: Features, b: Features, b_area_px: float, settings: Setti
         if found.log10_false_alarms < best.log10_false_alarms:
             best = found
     return best
+
+
+def estimate_of_moved(found: Estimate, a: Picture, b: Picture, settings: Settings) -> Estimate:
+    """Where what was found is an overlay, the same from the matches that move otherwise."""
+    matches = found.matches
+    pairs = a.features.points[matches.ref], b.features.points[matches.cur]
+    a_points, b_points = (side[found.is_inlier] for side in pairs)
+    overlay = overlay_like(a_points, b_points, a.size_wh, b.size_wh)
+    if overlay is None:
+        return Estimate(Verdict.TOO_FEW_MATCHES, matches, found.is_inlier)
+    moved = ~stands(*pairs, overlay, b.size_wh)
+    left = Matches(matches.ref[moved], matches.cur[moved], matches.distances[moved])
+    b_area_px = float(b.size_wh[0] * b.size_wh[1])
+    return _estimate(left, a.features, b.features, b_area_px, settings)
 
 
 def _estimate(

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.mosaic.pairs.agreement import Agreement
-from streamtrack.mosaic.pairs.direct import model_basis
 from streamtrack.types import Mask, Matrix, Model, Points, Size, Verdict
-
-Doubles = npt.NDArray[np.float64]
+from streamtrack.uncertainty import corner_sigmas_px
 
 _MIN_SUPPORT = 12
 _MIN_SUPPORT_SHARE = 0.2
@@ -23,7 +20,7 @@ _MIN_TILES = 6
 _MIN_ALIKE = 0.18
 _MIN_DETAIL = 0.12
 _MAX_SIGMA_SHARE = 0.03
-_INDEPENDENT_ERRORS = 25.0
+_LEAST_SIGMA_PX = 0.01
 
 
 def judge_link(
@@ -54,8 +51,9 @@ def judge_link(
         or agreement.detail < _MIN_DETAIL
     ):
         return Verdict.LOW_CORRELATION
-    sigma_px = corner_sigma_px(b_from_a, model, a_points, b_points, a_wh)
-    if not sigma_px <= _MAX_SIGMA_SHARE * max(b_wh):
+    corners = geometry.image_quad(a_wh)
+    sigmas_px = corner_sigmas_px(b_from_a, model, a_points, b_points, corners, _LEAST_SIGMA_PX)
+    if not np.max(sigmas_px) <= _MAX_SIGMA_SHARE * max(b_wh):
         return Verdict.UNCERTAIN
     return Verdict.OK
 
@@ -106,38 +104,3 @@ def _spread_share(b_from_a: Matrix, a_points: Points, a_wh: Size, b_wh: Size) ->
     hull = cv2.convexHull(geometry.transform_points(b_from_a, a_points))
     quad = geometry.transform_points(b_from_a, geometry.image_quad(a_wh))
     return float(cv2.contourArea(hull)) / max(geometry.clipped_quad_area(quad, b_wh), 1.0)
-
-
-def corner_sigma_px(
-    b_from_a: Matrix, model: Model, a_points: Points, b_points: Points, a_wh: Size
-) -> float:
-    """Standard deviation in b of where the least certain corner of picture a comes to lie.
-
-    First-order propagation of the inliers' residuals through the least squares (Hartley &
-    Zisserman, section 5.2). Residuals of a scene that is not quite flat are alike among
-    neighbours, so that pairs beyond 25 count as no further evidence.
-    """
-    seen = geometry.transform_points(b_from_a, a_points).astype(np.float64)
-    corners = geometry.transform_points(b_from_a, geometry.image_quad(a_wh)).astype(np.float64)
-    centre, scale = seen.mean(axis=0), float(np.max(np.std(seen, axis=0))) + 1e-6
-    basis = model_basis(model)
-    rows = _rows((seen - centre) / scale) @ basis
-    residuals = b_points - seen
-    variance = float(np.mean(residuals**2)) + 0.01**2
-    normal = rows.T @ rows * min(1.0, _INDEPENDENT_ERRORS / len(seen))
-    try:
-        covariance = np.linalg.inv(normal) * variance
-    except np.linalg.LinAlgError:
-        return float("inf")
-    reach = (_rows((corners - centre) / scale) @ basis).reshape(4, 2, -1)
-    spreads = np.einsum("cik,kl,cil->c", reach, covariance, reach)
-    return float(np.sqrt(np.max(spreads)))
-
-
-def _rows(points: Doubles) -> Doubles:
-    """Change of places with the parameters h11 .. h32 of a homography at the identity, (2N, 8)."""
-    x, y = points.T
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    upper = np.stack([x, y, one, zero, zero, zero, -x * x, -x * y], axis=1)
-    lower = np.stack([zero, zero, zero, x, y, one, -x * y, -y * y], axis=1)
-    return np.stack([upper, lower], axis=1).reshape(-1, 8)

@@ -9,7 +9,9 @@ The cheap steps come first, so that pictures which share nothing are refused ear
 3. the transformation model by evidence, a robust least squares and, where the scene proves to
    be flat, a last alignment on the grey values themselves (`mosaic.direct`);
 4. the gate (`mosaic.link_gate`): inliers beyond chance and spread over the overlap, no fold, no
-   unbelievable area or perspective, certain corners, and detail that agrees.
+   unbelievable area or perspective, certain corners, and detail that agrees; and where hardly
+   anything moves, a scene that agrees too, not just a stamp or a frame (`mosaic.standing`). If
+   it does not, the matches that do move are asked alone.
 """
 
 from __future__ import annotations
@@ -32,8 +34,14 @@ from streamtrack.fitting import (
 from streamtrack.mosaic.pairs import direct
 from streamtrack.mosaic.pairs.agreement import measure_agreement
 from streamtrack.mosaic.pairs.ambiguity import is_ambiguous
-from streamtrack.mosaic.pairs.first_estimate import Estimate, estimate, estimate_by_zoom
+from streamtrack.mosaic.pairs.first_estimate import (
+    Estimate,
+    estimate,
+    estimate_by_zoom,
+    estimate_of_moved,
+)
 from streamtrack.mosaic.pairs.link_gate import judge_link
+from streamtrack.mosaic.pairs.standing import overlay_like, scene_differs
 from streamtrack.mosaic.pairs.subpixel import (
     Overlap,
     render_overlap,
@@ -118,7 +126,14 @@ class PictureRegistrar:
             found = second if second.b_from_a is not None else found
         if found.b_from_a is None:
             return _refusal(a, b, found, found.verdict)
-        return self._refined(a, b, found, found.b_from_a)
+        link = self._refined(a, b, found, found.b_from_a)
+        if link.b_from_a is not None:
+            return link
+        moved = estimate_of_moved(found, a, b, self._settings)
+        if moved.b_from_a is None:
+            return link
+        link_of_moved = self._refined(a, b, moved, moved.b_from_a)
+        return link_of_moved if link_of_moved.b_from_a is not None else link
 
     def _refined(self, a: Picture, b: Picture, found: Estimate, b_from_a: Matrix) -> Link:
         is_swapped = _is_coarser(b_from_a, found, a.features)
@@ -217,20 +232,17 @@ class PictureRegistrar:
         verdict = judge_link(b_from_a, model, a.size_wh, b.size_wh, points, is_inlier, agreement)
         if verdict is Verdict.OK and is_ambiguous(overlap):
             verdict = Verdict.AMBIGUOUS
-        if verdict is not Verdict.OK:
+        a_inliers, b_inliers = a_points[is_inlier], b_points[is_inlier]
+        overlay = overlay_like(a_inliers, b_inliers, a.size_wh, b.size_wh)
+        if overlay is not None and scene_differs(overlap):
+            verdict = Verdict.OVERLAY
+        symmetric_px = float("nan")
+        if verdict is Verdict.OK:
+            rmse_px = float(np.sqrt(np.mean(errors[is_inlier] ** 2)))
+            registration = Registration(verdict, b_from_a, model, is_inlier, rmse_px)
+            symmetric_px = symmetric_transfer_rmse(b_from_a, a_inliers, b_inliers)
+        else:
             registration = refused(verdict, len(a_points), is_inlier)
-            return Link(
-                a.index,
-                b.index,
-                a_points,
-                b_points,
-                registration,
-                found.matches,
-                overlap_ncc=agreement.ncc,
-            )
-        rmse_px = float(np.sqrt(np.mean(errors[is_inlier] ** 2)))
-        registration = Registration(Verdict.OK, b_from_a, model, is_inlier, rmse_px)
-        symmetric_px = symmetric_transfer_rmse(b_from_a, a_points[is_inlier], b_points[is_inlier])
         return Link(
             a.index,
             b.index,

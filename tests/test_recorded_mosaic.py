@@ -198,11 +198,25 @@ def test_without_a_mosaic_a_moving_camera_has_its_paths(tmp_path):
     assert rrd_columns(path, "/mosaic/image", BLOB)[0] == []
 
 
-def test_a_fixed_camera_needs_no_second_view(tmp_path):
+def test_a_fixed_camera_has_its_paths_on_the_background(tmp_path):
+    """A bar passes over the ground; it is in no picture of it once it has been elsewhere."""
     path, world = tmp_path / "fixed.rrd", WorldMotion()
     with Recorder(path, source(), Settings(), ["board"]) as recorder:
-        recorder.log(in_world(step_of(0, lost=()), world, True))
-    assert not any(name.startswith("/mosaic") for name in rrd_entities(path))
+        for index in range(100):
+            step = step_of(index, lost=())
+            image = np.full_like(step.frame.image, 90)
+            image[:, index : index + 10] = 255
+            fixed = CameraPose(np.eye(3))
+            frame = replace(step.frame, image=image)
+            recorder.log(world.placed(replace(step, frame=frame, camera=fixed)))
+    pictures = rrd_columns(path, "/mosaic/image", BLOB)[1]
+    assert 2 <= len(pictures) < 8
+    shown = cv2.imdecode(np.asarray(pictures[-1][0], np.uint8), cv2.IMREAD_COLOR)
+    assert shown[shown.shape[0] // 2].max() < 110
+    square_from_world = translation((768 - 4 * 160) / 2, (768 - 4 * 120) / 2) @ scaling(4.0)
+    (line,) = rrd_columns(path, "/mosaic/targets/board/path", STRIPS)[1][-1]
+    expected = transform_points(square_from_world, crossing(tracked("board", 0).quad))
+    np.testing.assert_allclose(line[0], expected[0], atol=1)
 
 
 def test_states_and_their_reasons(recorded):

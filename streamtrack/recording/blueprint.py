@@ -94,18 +94,22 @@ _MAX_SIDE_BY_SIDE = 3
 
 
 class World(StrEnum):
-    """What a recording shows of the world: nothing, paths alone, or a growing mosaic below them."""
+    """What a recording shows of the world: nothing, or paths, alone or over a picture of it.
+
+    The picture is the background of a camera that stands, or a growing mosaic.
+    """
 
     NONE = "none"
     PATHS = "paths"
+    BACKGROUND = "background"
     MOSAIC = "mosaic"
 
 
 def world_shown(settings: Settings, has_mosaic: bool) -> World:
-    """What the recording of a run shows; of a fixed camera the world is the picture."""
+    """What the recording of a run shows."""
     if has_mosaic:
         return World.MOSAIC
-    return World.NONE if settings.camera == "fixed" else World.PATHS
+    return World.BACKGROUND if settings.camera == "fixed" else World.PATHS
 
 
 @dataclass(frozen=True, slots=True)

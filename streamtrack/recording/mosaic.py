@@ -17,10 +17,11 @@ import rerun as rr
 from streamtrack.geometry import box_quad, inverted, scaling, transform_points, translation
 from streamtrack.mosaic.types import MosaicView, PlacedFrame
 from streamtrack.recording import blueprint, rows
+from streamtrack.recording.background import BackgroundPicture
 from streamtrack.recording.blueprint import TargetEntities
 from streamtrack.recording.video import jpeg_of
 from streamtrack.targets import color_number
-from streamtrack.types import Image, Matrix, Points, Size, Step, WorldPlace
+from streamtrack.types import Frame, Image, Matrix, Points, Size, Step, WorldPlace
 
 _IMAGE_EVERY_S = 1.0
 _SIDE, _MOST_ENLARGED = 768, 4.0
@@ -44,6 +45,7 @@ class MosaicLog:
         self._preview_from_world: Matrix | None = None
         self._last_image_s = -math.inf
         self._outlines = np.zeros((0, 4, 2), np.float32)
+        self._background = BackgroundPicture()
         self._pending: MosaicView | None = None
         self._quality = 0
         self._state = ""
@@ -66,6 +68,21 @@ class MosaicLog:
         self._frame_index = step.frame.index
         self._places = {track.name: track.world for track in step.tracks if track.world is not None}
         self._numbers = {t.name: color_number(t, place) for place, t in enumerate(step.tracks)}
+
+    def log_background(self, frame: Frame) -> None:
+        """Record what lies behind the targets of a camera that stands, where that is known anew."""
+        picture = self._background.seen(frame)
+        if picture is None:
+            return
+        if self._preview_from_world is None:
+            self._log_styles()
+        square, square_from_picture = _framed(picture)
+        width, height = frame.size_wh
+        small = scaling(picture.shape[1] / width, picture.shape[0] / height)
+        self._preview_from_world = square_from_picture @ small
+        self._stream.log(
+            blueprint.MOSAIC_IMAGE, rr.EncodedImage.from_fields(blob=self._jpeg(square))
+        )
 
     def log_world(self, step: Step) -> None:
         """Record the camera's view and the targets' paths where no mosaic is made, in world px."""

@@ -130,7 +130,9 @@ class StepLog:
             self.log_line("INFO", message)
         self._log_times(step)
         self._table.follow(step)
-        if self._world is blueprint.World.PATHS:
+        if self._world is blueprint.World.BACKGROUND:
+            self._mosaic.log_background(step.frame)
+        if self._world in (blueprint.World.PATHS, blueprint.World.BACKGROUND):
             self._mosaic.log_world(step)
         else:
             self._mosaic.follow(step)

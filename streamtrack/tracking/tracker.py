@@ -426,8 +426,13 @@ class HybridTracker:
         self._frames_lost = self._searches = 0
         self._was_seen = True
         evidence = Evidence(alignment.template_points, alignment.frame_points, found.is_inlier)
-        # It is followed all the same: what is seen of it leads to where more of it is seen.
-        if means != "view" and not self._is_certain(evidence, found.b_from_a, was_lost):
+        is_seen_all_around = self._last_seen >= CLEAR
+        if not (
+            means == "view"
+            or is_seen_all_around
+            or self._is_certain(evidence, found.b_from_a, was_lost)
+        ):
+            # It is followed all the same: what is seen of it leads to where more of it is seen.
             found = refused(Verdict.UNCERTAIN, len(evidence), found.is_inlier)
         return make_track(
             self.template, found, evidence, means, self._was_seen, alignment.correlation

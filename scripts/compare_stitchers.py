@@ -54,7 +54,7 @@ print(len(stitcher.images.names))
 def peers(names: list[str], out: Path, stitching: str) -> dict[str, list[list[str]] | str]:
     """Commands of each peer, run one after the other, or why it is skipped."""
     python = sys.executable
-    ours = [python, "-m", "streamtrack.cli", "mosaic", *names, "-o", str(out)]
+    ours = [python, "-m", "streamtrack", "mosaic", *names, "-o", str(out)]
     found: dict[str, list[list[str]] | str] = {
         "streamtrack": [[*ours, "--summary", f"{out}.json", "--quiet"]],
         "opencv PANORAMA": [[python, "-c", _OPENCV, "PANORAMA", str(out), *names]],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import hypot, log
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -54,14 +55,17 @@ def _biweights(errors: Doubles, threshold_px: float) -> Doubles:
     if len(near) == 0:
         return np.zeros(len(errors))
     # The median length of a 2-D Gaussian error is 1.1774 times its standard deviation.
-    scale = _median(near) / 1.1774
+    scale = median(near) / 1.1774
     cut = min(max(4.685 * scale, 0.25), threshold_px)
     weights: Doubles = np.where(errors < cut, (1 - (errors / cut) ** 2) ** 2, 0.0)
     return weights
 
 
-def _median(values: Doubles) -> float:
-    """The upper median: as good here as the mean of the two, and three times as fast."""
+def median(values: npt.NDArray[Any]) -> float:
+    """The upper median of values (M,), M > 0: as good here as the mean of the two, and faster.
+
+    (`np.median` is three times as slow and first loads numpy's masked arrays: 25 ms.)
+    """
     middle = len(values) // 2
     return float(np.partition(values, middle)[middle])
 
@@ -241,7 +245,7 @@ def fit_best_model(
     if len(ladder) == 1:
         return ladder[0], fits[ladder[0]]
     residuals = {model: transfer_errors(fits[model], a, b) for model in ladder}
-    noise_px = max(_MIN_NOISE_PX, _median(residuals[ladder[-1]]) / 1.1774)
+    noise_px = max(_MIN_NOISE_PX, median(residuals[ladder[-1]]) / 1.1774)
     penalty = log(4 * len(a))
 
     def gric(model: Model) -> float:

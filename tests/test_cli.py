@@ -327,6 +327,33 @@ def test_interrupt_closes_all_outputs(tmp_path: Path, target: str, number: int) 
     assert RrdReader(tmp_path / "r.rrd").store() is not None
 
 
+def test_interrupted_while_it_loads_it_ends_without_a_word() -> None:
+    code = """
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # not ignored, as in a shell's background
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name == "streamtrack.cli.mosaic":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+from streamtrack.__main__ import main
+main()
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGINT, b"", b"")
+
+
+def test_a_live_view_of_pictures_is_refused_before_it_is_announced(
+    tmp_path: Path, run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((40, 60), np.uint8))
+    assert run("mosaic", "a.png", "b.png", "-o", "m.png", "--live=") == 2
+    said = capsys.readouterr()
+    assert "--live" in said.err
+    assert said.out == ""
+
+
 def test_broken_pipe_ends_quietly(clip: Path, target: str, tmp_path: Path) -> None:
     reader, writer = os.pipe()
     os.close(reader)

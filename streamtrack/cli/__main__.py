@@ -1,3 +1,3 @@
-from streamtrack.cli import main
+from streamtrack.__main__ import main
 
 main()

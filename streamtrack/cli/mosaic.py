@@ -27,7 +27,6 @@ from streamtrack.errors import UsageError
 from streamtrack.sources.addresses import path_of
 
 if TYPE_CHECKING:
-    from streamtrack.recording.live_server import LiveAddress
     from streamtrack.settings import Settings
 
 
@@ -109,10 +108,13 @@ def mosaic(
         {"max_fps": max_fps, "retries": retries},
     )
     from streamtrack.mosaic.job import MosaicJob, MosaicOutputs
-    from streamtrack.mosaic.running import run_mosaic
+    from streamtrack.mosaic.running import is_of_stream, run_mosaic
 
-    address = None if live is None else _live_address(live, quiet)
+    address = None
+    if live is not None:
+        from streamtrack.recording.live_server import parse_live
 
+        address = parse_live(live)
     job = MosaicJob(
         tuple(inputs),
         chosen,
@@ -122,6 +124,10 @@ def mosaic(
         step,
         frames,
     )
+    if address is not None and is_of_stream(job) and not quiet:
+        # Said before it is there, as it is of no use unknown.
+        sys.stdout.write(f"Watch it: {address.page_url}\n")
+        sys.stdout.flush()
     with (
         warnings_on_stderr(quiet),
         stage_progress_for(quiet) as progress,
@@ -152,14 +158,3 @@ def _settings(
             "live": live_flags,
         },
     )
-
-
-def _live_address(text: str, quiet: bool) -> LiveAddress:
-    """Where the live view will be; said, as it is of no use unknown."""
-    from streamtrack.recording.live_server import parse_live
-
-    address = parse_live(text)
-    if not quiet:
-        sys.stdout.write(f"Watch it: {address.page_url}\n")
-        sys.stdout.flush()
-    return address

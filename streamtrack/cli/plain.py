@@ -12,26 +12,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol, TextIO
+from typing import TYPE_CHECKING, TextIO
+
+if TYPE_CHECKING:
+    from streamtrack.mosaic.job import MosaicProgress
 
 _LINE_EVERY_S = 5.0
 _REDRAW_EVERY_S = 0.1
-
-
-class StageProgress(Protocol):
-    """Told of stages and their parts (see `streamtrack.mosaic.job.MosaicProgress`)."""
-
-    def begin(self, stage: str, total: int | None) -> None: ...
-
-    def advance(self, text: str = "") -> None: ...
-
-
-class _Silent:
-    def begin(self, stage: str, total: int | None) -> None:
-        return None
-
-    def advance(self, text: str = "") -> None:
-        return None
 
 
 class _Lines:
@@ -70,10 +57,12 @@ class _Lines:
 
 
 @contextmanager
-def stage_progress_for(quiet: bool) -> Iterator[StageProgress]:
+def stage_progress_for(quiet: bool) -> Iterator[MosaicProgress]:
     """Progress on stderr, or none."""
     if quiet:
-        yield _Silent()
+        from streamtrack.mosaic.job import NoMosaicProgress
+
+        yield NoMosaicProgress()
         return
     lines = _Lines(sys.stderr)
     try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from streamtrack.errors import UsageError
 from streamtrack.mosaic.job import MosaicJob, MosaicOutcome, MosaicProgress
 
 
@@ -15,14 +14,17 @@ def run_mosaic(
 
     Raises StreamtrackError if it cannot even start or an output cannot be written.
     """
-    from streamtrack.mosaic.pictures.inputs import is_stream
-
-    if len(job.inputs) == 1 and is_stream(job.inputs[0]):
+    if is_of_stream(job):
         from streamtrack.mosaic.stream.job import run_stream_mosaic
 
         return run_stream_mosaic(job, progress, should_stop)
-    if job.outputs.live is not None:
-        raise UsageError("--live shows a stream as it goes, and these are pictures: leave it out")
     from streamtrack.mosaic.pictures.job import run_picture_mosaic
 
     return run_picture_mosaic(job, progress, should_stop)
+
+
+def is_of_stream(job: MosaicJob) -> bool:
+    """Is the job that of one stream, not of pictures?"""
+    from streamtrack.mosaic.pictures.inputs import is_stream
+
+    return len(job.inputs) == 1 and is_stream(job.inputs[0])

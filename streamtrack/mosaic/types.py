@@ -28,12 +28,14 @@ class Picture:
     """One picture to be placed in a mosaic, with its features (full-resolution pixels).
 
     ``index`` is its place among the inputs (command line, or frame of the stream) from 0.
+    ``cover`` (H, W) is 255 where a picture with transparency is opaque, else 0.
     """
 
     index: int
     name: str
     image: Image
     features: Features
+    cover: Image | None = None
 
     @property
     def size_wh(self) -> Size:

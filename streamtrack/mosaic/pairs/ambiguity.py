@@ -77,7 +77,8 @@ def _correlation_surface(near: Floats, far: Floats, seen: Floats) -> tuple[Float
     def correlated(a: Floats, b: Floats) -> Floats:
         product = cv2.mulSpectrums(a, b, 0, conjB=True)
         plane = cv2.dft(product, flags=cv2.DFT_INVERSE | cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT)
-        return np.fft.fftshift(np.asarray(plane, np.float32))
+        half = height // 2, width // 2
+        return np.asarray(np.roll(plane, half, axis=(0, 1)), np.float32)
 
     mask = spectrum(seen)
     both = correlated(spectrum(near), spectrum(far))

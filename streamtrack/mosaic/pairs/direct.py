@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
+from streamtrack.fitting import median
 from streamtrack.types import Image, Matrix, Model
 from streamtrack.uncertainty import MODEL_BASES
 
@@ -95,7 +96,7 @@ def _minimised(
             return None
         gain = _gain(plane, seen, values, inside)
         residual = gain * seen - values
-        noise = 1.4826 * float(np.median(np.abs(residual[inside]))) + 0.3
+        noise = 1.4826 * median(np.abs(residual[inside])) + 0.3
         weights = np.maximum(0, 1 - (residual / np.float32(4.685 * noise)) ** 2) ** 2 * inside
         jacobian = _jacobian((gx0 + gain * gx1) / (2 * unit), (gy0 + gain * gy1) / (2 * unit), u, v)
         jacobian = jacobian @ basis
@@ -135,9 +136,9 @@ def _gain(plane: Floats, seen: Floats, values: Floats, inside: npt.NDArray[np.bo
     """Gain (N,) as a plane over the picture that brings what is seen to the values."""
     rows = plane[inside] * seen[inside, None]
     target = values[inside]
-    base = float(np.median(np.abs(target)) + 0.5) / float(np.median(np.abs(seen[inside])) + 0.5)
+    base = (median(np.abs(target)) + 0.5) / (median(np.abs(seen[inside])) + 0.5)
     residual = np.float32(base) * seen[inside] - target
-    scale = np.float32(4.685 * 1.4826 * float(np.median(np.abs(residual))) + 1.0)
+    scale = np.float32(4.685 * 1.4826 * median(np.abs(residual)) + 1.0)
     weighted = rows * (np.maximum(0, 1 - (residual / scale) ** 2) ** 2)[:, None]
     normal = (weighted.T @ rows).astype(np.float64)
     normal[np.diag_indices(3)] *= 1 + 1e-3

@@ -29,6 +29,7 @@ from streamtrack.fitting import (
     fit_best_model,
     fit_robustly,
     gauss_newton_step,
+    median,
     transfer_errors,
 )
 from streamtrack.mosaic.pairs import direct
@@ -44,6 +45,7 @@ from streamtrack.mosaic.pairs.link_gate import judge_link
 from streamtrack.mosaic.pairs.standing import overlay_like, scene_differs
 from streamtrack.mosaic.pairs.subpixel import (
     Overlap,
+    opaque_part,
     render_overlap,
     rendered_again,
     tracked_corners,
@@ -143,6 +145,7 @@ class PictureRegistrar:
         if fit is None:
             return _refusal(a, b, found, Verdict.LOW_CORRELATION)
         aligned, final = self._aligned(fit, far.pyramid)
+        final = opaque_part(final, near.cover, far.cover)
         exact = geometry.inverted(aligned) if is_swapped else aligned
         points = (
             (fit.far_points, fit.near_points) if is_swapped else (fit.near_points, fit.far_points)
@@ -205,7 +208,7 @@ class PictureRegistrar:
         overlap = rendered_again(fit.overlap, far, fit.far_from_near)
         errors = transfer_errors(fit.far_from_near, fit.near_points, fit.far_points)
         far_px = geometry.local_scale(overlap.far_from_grid, np.array(overlap.size_wh) / 2)
-        if float(np.median(errors)) > _FLAT_PX * far_px:
+        if median(errors) > _FLAT_PX * far_px:
             return fit.far_from_near, overlap
         found = direct.align(overlap.near, overlap.far, overlap.covered, np.eye(3), fit.model)
         if found is None:
@@ -265,7 +268,7 @@ def _fit_evenly(model: Model, start: Matrix, a: Points, b: Points, threshold_px:
     near = errors[errors < threshold_px]
     if len(near) < _MIN_TRACKED:
         return start
-    cut = min(max(_EVEN_WIDTH * float(np.median(near)), 0.25), threshold_px)
+    cut = min(max(_EVEN_WIDTH * median(near), 0.25), threshold_px)
     weights = np.where(errors < cut, (1 - (errors / cut) ** 2) ** 2, 0.0)
     used = weights > 0
     if np.count_nonzero(used) < _MIN_TRACKED:

@@ -10,7 +10,7 @@ way is that of the other.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -92,6 +92,20 @@ def rendered_again(overlap: Overlap, far: Pyramid, far_from_near: Matrix) -> Ove
     again = Overlap(overlap.near, seen, covered, overlap.near_from_grid, far_from_grid)
     again.__dict__["near_detail"] = overlap.near_detail
     return again
+
+
+def opaque_part(overlap: Overlap, near_cover: Image | None, far_cover: Image | None) -> Overlap:
+    """The overlap without what is transparent: covers (H, W) are 255 where a picture is opaque."""
+    covered = overlap.covered
+    for cover, picture_from_grid in (
+        (near_cover, overlap.near_from_grid),
+        (far_cover, overlap.far_from_grid),
+    ):
+        if cover is not None:
+            flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+            seen = cv2.warpPerspective(cover, picture_from_grid, overlap.size_wh, flags=flags)
+            covered = np.asarray(cv2.bitwise_and(covered, seen), np.uint8)
+    return overlap if covered is overlap.covered else replace(overlap, covered=covered)
 
 
 def _overlap_box(

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from streamtrack.fitting import median
 from streamtrack.mosaic.gains import GainEdge, solve_gains
 from streamtrack.mosaic.pictures.seams import SmallPatch
 
@@ -40,7 +41,7 @@ def compensation_gains(
             continue
         logs_a = np.log(image_a[fit].astype(np.float32))
         logs_b = np.log(image_b[fit].astype(np.float32))
-        log_ratio = np.median(logs_b - logs_a, axis=0).astype(np.float64)
+        log_ratio = np.array([median(channel) for channel in (logs_b - logs_a).T])
         share = count / min(patches[a].cover.size, patches[b].cover.size)
         edges.append(GainEdge(row[pictures[a]], row[pictures[b]], log_ratio, min(1.0, share)))
     logs = solve_gains(len(row), edges)

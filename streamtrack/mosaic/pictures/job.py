@@ -94,6 +94,8 @@ def run_picture_mosaic(
 def _checked_paths(job: MosaicJob) -> list[Path]:
     """The pictures of the job. Raises UsageError or SourceError where no mosaic can come of it."""
     paths = picture_paths(job.inputs)[job.start :: job.step]
+    if job.outputs.live is not None:
+        raise UsageError("--live shows a stream as it goes, and these are pictures: leave it out")
     paths = paths if job.frames is None else paths[: job.frames]
     if len(paths) < 2:
         raise UsageError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -119,7 +119,12 @@ def load_pictures(
         found.small_from_full[index] = geometry.scaling(
             small.shape[1] / image.shape[1], small.shape[0] / image.shape[0]
         )
-        found.pictures[index] = registrar.picture(index, path.name, small)
+        picture = registrar.picture(index, path.name, small)
+        if index in found.covers:
+            size = picture.size_wh
+            cover = cv2.resize(found.covers[index], size, interpolation=cv2.INTER_NEAREST)
+            picture = replace(picture, cover=np.asarray(cover, np.uint8))
+        found.pictures[index] = picture
         advance(path.name)
     return found
 

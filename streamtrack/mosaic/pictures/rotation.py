@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
+from streamtrack.fitting import median
 from streamtrack.mosaic.types import Link
 from streamtrack.types import Matrix, Points, Size
 
@@ -155,7 +156,7 @@ def _median_misfit(
         k_b = camera_matrix(focal * max(sizes[link.b]), sizes[link.b])
         turned = k_b @ rotation_between(link.b_from_a, k_a, k_b) @ np.linalg.inv(k_a)
         error = geometry.transform_points(turned, points) - seen
-        errors.append(float(np.median(np.linalg.norm(error, axis=1))))
+        errors.append(median(np.linalg.norm(error, axis=1)))
     return float(np.median(errors))
 
 
@@ -201,7 +202,7 @@ def adjust_rotations(
     errors = [_lengths(_residuals(state, scales, p)[0]) for p in pairs]
     joined = np.concatenate([errors[i] for i, p in enumerate(pairs) if p in _telling(pairs)])
     near = joined[joined < 3 * noise_px]
-    medians = dict(zip(map(id, used), (float(np.median(e)) for e in errors), strict=True))
+    medians = dict(zip(map(id, used), (median(e) for e in errors), strict=True))
     to_anchor = state.rotations[row[anchor]].T
     return Rotations(
         {picture: to_anchor @ state.rotations[i] for picture, i in row.items()},
@@ -361,7 +362,7 @@ def _noise(state: _State, scales: Doubles, pairs: Sequence[_Pairs]) -> float:
     """Standard deviation of one coordinate, from the median length of all residuals."""
     told = _telling(pairs)
     lengths = np.concatenate([_lengths(_residuals(state, scales, p)[0]) for p in told])
-    return max(_MIN_NOISE_PX, float(np.median(lengths)) / 1.1774)
+    return max(_MIN_NOISE_PX, median(lengths) / 1.1774)
 
 
 def _cost(state: _State, scales: Doubles, pairs: Sequence[_Pairs], noise_px: float) -> float:

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from streamtrack.fitting import median
 from streamtrack.mosaic.pictures.projection import Box
 from streamtrack.types import Image, Size
 
@@ -108,7 +109,7 @@ def _give_away_things(
 
     It goes to the side whose pixels it touches or, free all round, to the nearer one.
     """
-    typical = float(np.median(cost[free > 0])) if free.any() else 0.0
+    typical = median(cost[free > 0]) if free.any() else 0.0
     things = np.asarray((cost > max(_MIN_DIFFERENCE, _MANIFOLD * typical)) & (free > 0), np.uint8)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(things, connectivity=8)
     most = _MOST_OF_STRIP * np.count_nonzero(free)
@@ -133,8 +134,10 @@ def _flooded(cost: Image, old: Image, new: Image, free: Image) -> tuple[Image, I
     x0, x1 = max(0, int(xs.min()) - 1), int(xs.max()) + 2
     part = slice(y0, y1), slice(x0, x1)
     cost, old, grown, left = cost[part], old[part].copy(), new[part].copy(), free[part].copy()
-    levels = np.unique(np.quantile(cost[left > 0], np.linspace(1, 0, _LEVELS + 1)[1:]))[::-1]
-    for level in levels:
+    costs = np.sort(cost[left > 0])
+    shares = np.linspace(0, 1, _LEVELS, endpoint=False)
+    levels = {int(costs[round(share * (len(costs) - 1))]) for share in shares}
+    for level in sorted(levels, reverse=True):
         high = np.asarray(cost >= level, np.uint8) * np.uint8(255)
         allowed = cv2.bitwise_and(left, high)
         for _ in range(_STEPS):

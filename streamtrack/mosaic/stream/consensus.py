@@ -22,6 +22,7 @@ from streamtrack.types import Image, Mask, Size
 _STOOD_BACK = np.where(np.arange(256) > 0, np.maximum(np.arange(256) // 6, 1), 0).astype(np.uint8)
 """Weights of samples that stand back: they win where no primary one shows anything."""
 
+_SMOOTH, _HALF = (7, 7), 120  # of 255: a little more is shut out than the cells
 _GAP = 8
 
 Labels: TypeAlias = npt.NDArray[np.int16]
@@ -168,9 +169,11 @@ class Chooser:
         return Choice(tuple(self._samples), _without_holes(weights, judged), tally)
 
     def _shut_out(self, weight: Image, outlier: Mask) -> Image:
-        mask = outlier.view(np.uint8)
-        full = cv2.resize(mask, self._size_wh, interpolation=cv2.INTER_NEAREST)
-        return np.asarray(cv2.copyTo(weight, cv2.inRange(full, 0, 0)), np.uint8)
+        # Judged in cells of 4 pixels, shut out within a smooth outline around these.
+        cells = outlier.view(np.uint8) * np.uint8(255)
+        full = cv2.resize(cells, self._size_wh, interpolation=cv2.INTER_LINEAR)
+        smooth = cv2.blur(full, _SMOOTH)
+        return np.asarray(cv2.copyTo(weight, cv2.inRange(smooth, 0, _HALF)), np.uint8)
 
 
 def _without_holes(weights: Sequence[Image], judged: Sequence[Image]) -> tuple[Image, ...]:

@@ -229,7 +229,7 @@ PEERS: dict[str, Peer] = {
 
 
 def scenes(
-    seeds: Sequence[int], frames: int, cars: int, size: str
+    seeds: Sequence[int], frames: int, cars: int, size: str, image: Path | None
 ) -> Iterator[tuple[str, str, str]]:
     """Name, URI and the camera to assume."""
     for camera in ("fixed", "moving"):
@@ -237,6 +237,7 @@ def scenes(
             for seed in seeds:
                 uri = f"synthetic://traffic?seed={seed}&frames={frames}&cars={cars}&fps=25"
                 uri += f"&size={size}&camera={camera}&occluders={bridges}"
+                uri += "" if image is None else f"&image={image}"
                 yield f"{camera}{' bridge' if bridges else ''}", uri, camera
 
 
@@ -246,6 +247,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--cars", type=int, default=20)
     parser.add_argument("--size", default="640x360")
+    parser.add_argument("--image", type=Path, help="a photograph as the ground")
     parser.add_argument("--no-peers", action="store_true")
     parser.add_argument("--each", action="store_true", help="a line a scene, too")
     parser.add_argument("--output", type=Path, help="write the table there as well")
@@ -255,7 +257,7 @@ def main() -> None:
     seeds = range(int(first), int(last or first) + 1)
     rows: dict[tuple[str, str], list[dict[str, float]]] = {}
     costs: dict[str, list[tuple[float, float, int]]] = {}
-    for name, uri, camera in scenes(seeds, args.frames, args.cars, args.size):
+    for name, uri, camera in scenes(seeds, args.frames, args.cars, args.size, args.image):
         run = run_own(uri, camera)
         costs.setdefault(name, []).append((run.auto_ms, run.camera_ms, run.most_at_once))
         results = {"streamtrack": run.found}

@@ -187,7 +187,8 @@ class Summary:
             return []
         found = [target for target in self.targets if target.is_found]
         if not found:
-            return [("Automatic targets", "none: nothing was seen to move against the background")]
+            text = "none: nothing was seen to move by itself against a background at rest"
+            return [("Automatic targets", text)]
         lives = sorted(target.frames_tracked for target in found)
         text = (
             f"{self.auto_count}, at most {self.auto_at_once} at once; tracked in "

@@ -152,11 +152,12 @@ class BackgroundModel:
         """
         image, off, seen, self._mean = self._last
         is_young = self._age < _KNOWN_AGE
-        self._age[is_young & moving] = 0
+        is_no_ground = moving | protected
+        self._age[is_young & is_no_ground] = 0
         is_new = seen & (self._age == 0)
         if is_new.any():
             self._mean[is_new] = image[is_new]
-            self._age[is_new & ~moving] = 1
+            self._age[is_new & ~is_no_ground] = 1
         matches = seen & ~outstanding.faint & ~is_new
         rate = np.where(matches, 1 / np.minimum(self._age + 1, _MAX_AGE), 0).astype(np.float32)
         change = cv2.subtract(image, self._mean, dtype=cv2.CV_32F)

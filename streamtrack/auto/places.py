@@ -20,6 +20,10 @@ Doubles: TypeAlias = npt.NDArray[np.float64]
 
 _WIDTH_PX = 320
 REST_PX = 0.4  # grid pixels a frame, below which something stands
+_CELL_PX = 8
+_CORNER = 2e-4  # least eigenvalue of the structure tensor by `cv2.cornerMinEigenVal`
+_LEAST_CORNERS = 12
+_STANDS_PX = 0.5  # grid pixels a frame
 _CHANGE_FACTOR = 4.0  # of the noise, by which a pixel differs from the frame before
 
 
@@ -68,6 +72,25 @@ def moving_pixels(seen: Outstanding, motion: npt.NDArray[np.float32] | None) -> 
     around = cv2.dilate(changed, np.ones((9, 9), np.uint8)) > 0
     within = cv2.morphologyEx(changed, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)) > 0
     return flows & around, flows & within
+
+
+def resting_share(
+    seen: Outstanding, motion: npt.NDArray[np.float32] | None, elsewhere: Mask
+) -> float:
+    """Which share of the picture's corners, outside ``elsewhere`` (h, w), is at rest.
+
+    Where few are, the pose tells little of what moves (waves, water and a herd before a camera that
+    goes along). 1 where there are too few corners to say so.
+    """
+    if motion is None:
+        return 1.0
+    cells = slice(_CELL_PX // 2, None, _CELL_PX), slice(_CELL_PX // 2, None, _CELL_PX)
+    strength = cv2.cornerMinEigenVal(seen.grey, 5)[cells]
+    told = (strength > _CORNER) & seen.comparable[cells] & ~elsewhere[cells]
+    moved = motion[cells][told]
+    if len(moved) < _LEAST_CORNERS:
+        return 1.0
+    return float(np.mean(np.hypot(moved[:, 0], moved[:, 1]) < _STANDS_PX))
 
 
 def hidden_by(seen: Outstanding, given: Sequence[Track]) -> Mask:

@@ -38,6 +38,7 @@ from streamtrack.auto.places import (
     is_invertible,
     moving_pixels,
     reduced,
+    resting_share,
 )
 from streamtrack.frame_view import FrameView
 from streamtrack.types import (
@@ -65,6 +66,7 @@ _MAX_MISSES = 2  # frames, of what is not confirmed yet
 _COAST_S = 2.0
 _SLOWER_AFTER_S = 0.5  # lost, until which it is thought to go on as fast
 _MOST_TARGETS = 60
+_LEAST_RESTING = 0.34  # of the picture's corners, for anything to be said to move by itself
 _BROKEN_FRAMES = 5  # in a row, after which the scene is another one
 _REACH_PX = 4.0  # grid pixels, beyond which nothing is found again
 _REST_FRAMES = 8
@@ -128,7 +130,7 @@ class AutoTargets:
         moment = Moment(step_s, frame_px(seen), view.size_wh)
         self._associate(scene, moment)
         self._background.learn(seen, moving, self._protected(seen))
-        self._confirm(self._background, scene, moment)
+        self._confirm(self._background, seen, scene, moment)
         end_duplicates(self._things, moment)
         self._end_left_places(self._background, scene, moment)
         return self._tracks()
@@ -220,15 +222,25 @@ class AutoTargets:
             if thing.life in (Life.SEEN, Life.CARRIED)
         )
 
-    def _confirm(self, background: BackgroundModel, scene: Scene, moment: Moment) -> None:
+    def _confirm(
+        self, background: BackgroundModel, seen: Outstanding, scene: Scene, moment: Moment
+    ) -> None:
         """Name the things that have been seen often enough and have moved."""
         least = max(_LEAST_HITS, round(_CONFIRMED_S / self._step_s))
         named = sum(thing.life is not Life.NEW for thing in self._things)
-        for thing in self._things:
-            if thing.life is not Life.NEW or thing.misses or thing.hits < least:
-                continue
-            if named >= _MOST_TARGETS or not _has_moved(thing, moment.grid_px):
-                continue
+        ripe = [
+            thing
+            for thing in self._things
+            if thing.life is Life.NEW
+            and not thing.misses
+            and thing.hits >= least
+            and _has_moved(thing, moment.grid_px)
+        ]
+        if not ripe:
+            return
+        if resting_share(seen, scene.motion, self._protected(seen)) < _LEAST_RESTING:
+            return
+        for thing in ripe[: max(0, _MOST_TARGETS - named)]:
             if _end_left_place(thing, background, scene):
                 continue
             before = found_again(thing, self._things, _REACH_PX * moment.grid_px)
@@ -237,7 +249,6 @@ class AutoTargets:
                 thing.name, thing.home = before.name, before.home
             else:
                 thing.name, thing.home = self._next_name(), thing.box.copy()
-                named += 1
             thing.life = Life.SEEN
         self._things = [thing for thing in self._things if thing.life is not Life.OVER]
 

@@ -210,6 +210,43 @@ def test_two_that_cross_keep_their_names() -> None:
     assert (after_a, after_b) == (before_a, before_b)
 
 
+def test_one_that_drives_slowly_over_another_keeps_its_name_and_so_does_the_other() -> None:
+    world = World()
+    world.add("wide", (70, 30), 150, 250)
+    world.things["dark"] = texture(5, (18, 30), 0, 60)
+
+    def path(n: int) -> dict[str, tuple[float, float]]:
+        return {"wide": (3.0 * n - 72, 104), "dark": (190 - 0.8 * n, 208 - 1.4 * n)}
+
+    made = [world.frame(index, path(index)) for index in range(105)]
+    steps, truth = follow([frame for frame, _ in made]), [boxes for _, boxes in made]
+    names = {thing: names_on(steps, truth, thing) for thing in ("wide", "dark")}
+    assert names["wide"][40] != names["dark"][20]
+    for thing in ("wide", "dark"):
+        assert names[thing][40] is not None
+        assert names[thing][100] == names[thing][40]
+
+
+@pytest.mark.parametrize("is_estimated", [False, True])
+def test_where_nearly_all_that_is_seen_moves_an_estimated_pose_is_not_believed(
+    is_estimated: bool,
+) -> None:
+    """The things may be the scene then, as surf and a herd are for a camera that goes along."""
+    world = World()
+    world.ground[:] = 100
+    places = list(itertools.product(range(30, 300, 60), range(16, 220, 52)))
+    for number in range(len(places)):
+        world.add(str(number), (34, 30))
+
+    def at(number: int, n: int) -> tuple[float, float]:
+        angle, (x, y) = 2.4 * number, places[number]
+        return x - 17 + 0.9 * n * np.cos(angle), y - 15 + 0.9 * n * np.sin(angle)
+
+    frames = [world.frame(n, {str(k): at(k, n) for k in range(len(places))})[0] for n in range(14)]
+    poses = [CameraPose(translation(0.01 * n, 0)) if is_estimated else STANDS for n in range(14)]
+    assert bool(all_names(follow(frames, poses))) is not is_estimated
+
+
 def test_what_is_hidden_is_lost_and_found_again_under_its_name() -> None:
     world = World()
     world.add("car", (40, 26))

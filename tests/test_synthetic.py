@@ -100,6 +100,20 @@ def test_truth_agrees_with_pixels(photo: Path, scene: str, indices: tuple[int, .
         assert np.abs(away).max() < 0.06
 
 
+@pytest.mark.parametrize("camera", ["fixed", "moving"])
+def test_a_photo_is_the_ground_of_traffic_for_ever(photo: Path, camera: str) -> None:
+    plain, own = (
+        source_of("traffic", f"seed=3&frames=120&camera={camera}&{CLEAN}{image}")
+        for image in ("", f"&image={photo}")
+    )
+    for index in (0, 119):
+        thing = own.things(index)[0]
+        assert np.array_equal(thing.quad, plain.things(index)[0].quad)
+        picture = own.frame(index).image
+        assert np.abs(np.diff(picture.astype(int), axis=1)).mean() > 0.5  # no border drawn out
+        assert not np.array_equal(picture, plain.frame(index).image)
+
+
 def test_truth_is_the_middle_of_the_exposure(photo: Path) -> None:
     source = source_of("board", f"noise=0&blur=0.5&image={photo}")
     for index in (30, 71):

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.auto.blobs import Blob, Scene
-from streamtrack.auto.boxes import box_around, overlaps
+from streamtrack.auto.boxes import box_around, overlap, overlaps
 from streamtrack.auto.followed import Followed, Life
 from streamtrack.auto.likeness import Likeness
 from streamtrack.auto.places import Moment, motion_within
@@ -28,6 +28,7 @@ _CORE_SHARE = 0.75
 _ELDER_HITS = 10  # sightings of its own that make it a thing of its own
 _ALIKE_PX = 0.8  # grid pixels a frame, between motions of parts of one thing
 _DUPLICATE_OVERLAP = 0.75
+_BESIDE = 0.3  # of a thing's box in another's, less than which they lie side by side
 _PORTRAIT_FRAMES = 3  # between two pictures of a thing
 _MOST_GUESSED = 10  # frames that a hidden thing goes on as before
 
@@ -92,12 +93,21 @@ def own_things(things: Sequence[Followed], moment: Moment) -> list[Followed]:
 
     Fragments were hardly ever seen alone, and move as the rest does.
     """
-    elders = [thing for thing in things if thing.alone >= _ELDER_HITS]
+    elders = [thing for thing in things if _is_own(thing, things)]
     first = max(things, key=lambda thing: thing.hits)
     others = [
         thing for thing in things if thing not in elders and not is_alike(thing, first, moment)
     ]
     return [*(elders or [first]), *(thing for thing in others if thing is not first)]
+
+
+def _is_own(thing: Followed, beside: Sequence[Followed]) -> bool:
+    """Was it seen alone, or for long beside the others, hardly over them?"""
+    if thing.alone >= _ELDER_HITS:
+        return True
+    return thing.hits >= _ELDER_HITS and all(
+        overlap(thing.box, other.box)[1] < _BESIDE for other in beside if other is not thing
+    )
 
 
 def end_duplicates(things: Sequence[Followed], moment: Moment) -> None:

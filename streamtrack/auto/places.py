@@ -29,11 +29,15 @@ _CHANGE_FACTOR = 4.0  # of the noise, by which a pixel differs from the frame be
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """Seconds since the frame before, frame pixels a grid pixel, and the frame's size."""
+    """Seconds since the frame before, frame pixels a grid pixel, the frame's size.
+
+    ``is_fixed`` says that the camera stands, so that its pose cannot be wrong.
+    """
 
     step_s: float
     grid_px: float
     size_wh: Size
+    is_fixed: bool
 
 
 def reduced(view: FrameView) -> tuple[Image, Matrix]:

@@ -127,7 +127,8 @@ class AutoTargets:
         seen = self._background.with_young(seen, changing)
         scene = find_blobs(seen, hidden_by(seen, given), motion)
         self.blobs = scene.blobs
-        moment = Moment(step_s, frame_px(seen), view.size_wh)
+        is_fixed = np.array_equal(world_from_frame, np.eye(3))
+        moment = Moment(step_s, frame_px(seen), view.size_wh, is_fixed)
         self._associate(scene, moment)
         self._background.learn(seen, moving, self._protected(seen))
         self._confirm(self._background, seen, scene, moment)
@@ -238,8 +239,10 @@ class AutoTargets:
         ]
         if not ripe:
             return
-        if resting_share(seen, scene.motion, self._protected(seen)) < _LEAST_RESTING:
-            return
+        if not moment.is_fixed:
+            resting = resting_share(seen, scene.motion, self._protected(seen))
+            if resting < _LEAST_RESTING:
+                return
         for thing in ripe[: max(0, _MOST_TARGETS - named)]:
             if _end_left_place(thing, background, scene):
                 continue

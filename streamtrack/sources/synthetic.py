@@ -5,9 +5,9 @@ same URI always gives the same bytes. Parameters: ``seed``, ``frames``, ``size``
 fraction as 30000/1001), ``noise`` (standard deviation of each channel in grey levels), ``blur``
 (exposure as a share of the time between frames, 0..1), ``light`` (strength of changes of light,
 0..1), ``occluders`` (how many), ``image`` (a picture of yours as the target's texture, or as the
-land of ``flight``), ``texture`` (one of the painted kinds), for ``flight`` ``step`` (px a frame),
-and for ``traffic`` ``cars`` (how many come by) and ``camera`` (``fixed`` or ``moving``); there
-``occluders`` are footbridges.
+land of ``flight`` or the ground of ``traffic``), ``texture`` (one of the painted kinds), for
+``flight`` ``step`` (px a frame), and for ``traffic`` ``cars`` (how many come by) and ``camera``
+(``fixed`` or ``moving``); there ``occluders`` are footbridges.
 """
 
 from __future__ import annotations

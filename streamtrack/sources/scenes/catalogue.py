@@ -293,7 +293,13 @@ def _traffic(request: Request) -> Scene:
     cars = traffic.cars_on(request.seed, road, request.frames, size_wh, view, request.cars)
     bridges = traffic.bridges_over(request.seed, road, size_wh, view, request.occluders or 0)
     road_rng = stream(request.seed, "road")
-    ground = cache(lambda: roadside.paint_road(road_rng, height, lane_px, reach))
+
+    @cache
+    def ground() -> Ground:
+        if request.image is not None:
+            return _mirrored(request.image, height, reach)
+        return roadside.paint_road(road_rng, height, lane_px, reach)
+
     first = cars[0]
     scene = _travelling(request, ground, view, first.frame_from_sprite, first.sprite)
     return replace(scene, others=cars[1:], occluders=tuple(bridges))
@@ -314,6 +320,15 @@ def _flight(request: Request) -> Scene:
         return Ground(terrain.paint_terrain(paints, extent, landmark.astype(np.float64)))
 
     return _travelling(request, ground, view, view, landmark)
+
+
+def _mirrored(picture: Image, height: int, margin: int) -> Ground:
+    """The picture at a height, itself and its mirror image by turns along x for ever."""
+    width = max(2, round(picture.shape[1] * height / picture.shape[0]))
+    once = _filling(picture, (width, height))
+    both = np.concatenate([once, once[:, ::-1]], axis=1)
+    columns = np.arange(2 * width + margin) % (2 * width)
+    return Ground(both[:, columns], 2 * width)
 
 
 def _filling(picture: Image, extent: Size) -> Image:

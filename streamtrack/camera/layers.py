@@ -62,8 +62,12 @@ class Doubts:
         self._frames[keyframe] += 1
         return self._frames[keyframe].bit_count() == 1
 
+    def go_on(self, keyframe: int) -> None:
+        """Something moves before this keyframe, too."""
+        self._frames[keyframe] += 1
+
     def about(self, keyframe: int) -> bool:
-        """Whether there were any about frames that were aligned with a keyframe."""
+        """Whether there were any about a keyframe or frames that were aligned with it."""
         return self._frames[keyframe] > 0
 
 

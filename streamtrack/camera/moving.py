@@ -293,7 +293,7 @@ class MovingCamera:
             return False
         assert found.reference_from_view is not None
         index = view.frame.index
-        reference = self._new_reference(view.levels, before, hidden, keyframe, found)
+        reference = self._new_reference(view, before, hidden, keyframe, found)
         keyframe_from_frame, link = found.reference_from_view, link_of(index, keyframe, found)
         is_sure = found.inliers >= _MIN_AGREEING_CELLS
         if not is_sure:
@@ -314,23 +314,24 @@ class MovingCamera:
 
     def _new_reference(
         self,
-        levels: ViewLevels,
+        view: FrameView,
         before: _State | None,
         hidden: Sequence[Points],
         keyframe: int,
         found: ViewAlignment,
     ) -> ReferenceView:
         """The view of a new keyframe, without what has moved by itself since the frame before."""
+        index, levels = view.frame.index, view.levels
         reference = ReferenceView(levels, hidden)
-        is_doubtful = self._doubts.about(keyframe) or self.graph.keyframes[keyframe].hidden
-        if before is None or before.keyframe != keyframe or not is_doubtful:
+        if before is None or before.keyframe != keyframe or not self._doubts.about(keyframe):
             return reference
         assert found.reference_from_view is not None
         here_from_before = geometry.inverted(found.reference_from_view) @ before.keyframe_from_frame
         ours = replace(found, reference_from_view=here_from_before)
         layers = separated(reference, before.levels, ours, hidden)
-        if layers.background is not ours:
+        if layers.background is not ours or not layers.foreground:
             return reference
+        self._doubts.go_on(index)
         return ReferenceView(levels, (*hidden, *layers.foreground))
 
     def _take(

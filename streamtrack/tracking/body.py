@@ -14,6 +14,8 @@ import numpy as np
 from streamtrack import geometry
 from streamtrack.fitting import fit
 from streamtrack.tracking.correlation_filter import CorrelationFilter, Sighting
+from streamtrack.tracking.template import Template
+from streamtrack.tracking.views import Sight
 from streamtrack.types import Image, Matrix, Model, Points
 
 _LEAST_ANSWER = 0.18
@@ -25,8 +27,21 @@ _LEARNT_ANSWER = 0.22
 _LEARNT_IN_VIEW = 0.9
 _LEAST_IN_VIEW = 0.25
 _LEAST_PART = 0.5  # of the answer, for a target that is partly out of view
+_FRAMES_BETWEEN_SCALES = 2
 _TURNED_ADVANTAGE = 1.2  # in the answer, of a size and turn that a plane would have
 _RATE = 0.03  # share of a new frame in the renewed filter
+
+
+def begun_body(template: Template, sight: Sight, *, is_same_camera: bool) -> Body:
+    """The template's target as a body, as a later sight of it shows it.
+
+    A template picture of another camera is no first view: what surrounds the target is not in it.
+    """
+    if not is_same_camera:
+        return Body(sight.image, sight.frame_from_template, template.quad)
+    body = Body(template.picture, np.eye(3), template.quad)
+    body.take_over(sight.image, sight.template_points, sight.shown)
+    return body
 
 
 class Body:
@@ -42,6 +57,7 @@ class Body:
         self._filter = CorrelationFilter(image, self._pose, quad)
         self._is_growing = False
         self._frames = 0
+        self.frames_seen = 0
 
     def take_over(self, image: Image, template_points: Points, frame_points: Points) -> None:
         """Go on from a later view, in which the pairs of points (N, 2) agreed as if it were flat.
@@ -63,18 +79,23 @@ class Body:
         """The pose (a similarity) in the next frame, None if the target is not seen there.
 
         It is looked for near ``guess``, of which only the place counts, as sizes do not go on as
-        they were; and where it last was, as steps and leaps do not either.
+        they were; and where it last was, as steps and leaps do not either. More is asked of a
+        target that was lost, and of the first frame.
         """
         self._frames += 1
+        was_lost = was_lost or self.frames_seen == 0
         for pose in (self._moved_to(guess), self._pose):
-            # Scales are looked at in every second frame, and while the target grows or shrinks.
-            at_scales = not was_lost and (self._is_growing or self._frames % 2 == 0)
+            # Scales are looked at now and then, and while the target grows or shrinks.
+            at_scales = not was_lost and (
+                self._is_growing or self._frames % _FRAMES_BETWEEN_SCALES == 0
+            )
             found = self._filter.locate(image, pose, at_other_scales=at_scales)
             seen = geometry.transform_points(found.pose, self._quad)
             in_view = geometry.visible_share(seen, (image.shape[1], image.shape[0]))
             if _is_seen(found, in_view, was_lost=was_lost):
                 self._is_growing = found.is_scaled
                 self._pose = found.pose
+                self.frames_seen += 1
                 if in_view >= _LEARNT_IN_VIEW and found.answer >= _LEARNT_ANSWER:
                     self._filter.learn(image, found.pose, _RATE)
                 return found.pose

@@ -192,14 +192,12 @@ def _feature_maps(window: Image, cells: Size) -> Floats:
     gradients = np.asarray(directions, np.float32)
     around = cv2.blur(np.square(gradients).sum(axis=0), (3, 3))
     gradients /= np.sqrt(around) + np.float32(_NOISE_GRADIENT)
-    small = cv2.resize(window, cells, interpolation=cv2.INTER_AREA)
-    colors = np.asarray(small, np.float32)[None] / np.float32(2.55 * _LIGHTNESS_RANGE)
-    if window.ndim == 3:
-        lab = cv2.cvtColor(small.astype(np.float32) / np.float32(255), cv2.COLOR_BGR2LAB)
-        ranges = np.array([_LIGHTNESS_RANGE, _CHROMA_RANGE, _CHROMA_RANGE], np.float32)
-        colors = np.asarray(lab / ranges, np.float32).transpose(2, 0, 1)
+    small = cv2.resize(window, cells, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+    bgr = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR) if small.ndim == 2 else small
+    ranges = np.array([_LIGHTNESS_RANGE, _CHROMA_RANGE, _CHROMA_RANGE], np.float32)
+    colors = (cv2.cvtColor(bgr, cv2.COLOR_BGR2LAB) / ranges).transpose(2, 0, 1)
     colors = colors - colors.mean(axis=(1, 2), keepdims=True)
-    return np.concatenate([gradients, colors])
+    return np.asarray(np.concatenate([gradients, colors]), np.float32)
 
 
 def _peak(cells: Size, sigma: float) -> Floats:

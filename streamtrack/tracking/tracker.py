@@ -32,7 +32,7 @@ from streamtrack.tracking.appearance import (
     chroma_distance,
     prepare_colors,
 )
-from streamtrack.tracking.body import Body
+from streamtrack.tracking.body import Body, begun_body
 from streamtrack.tracking.certainty import (
     MAX_SIGMA_FOLLOWED_PX,
     MAX_SIGMA_FOUND_PX,
@@ -124,7 +124,6 @@ class HybridTracker:
         self._views = RecentViews(template, settings.registration)
         self._is_in_view = False
         self._body: Body | None = None
-        self._body_frames = 0
         self._flatness = Flatness(template.quad)
         self._frames_to_next_view = 0
         self._frames_to_next_near = 0
@@ -301,12 +300,7 @@ class HybridTracker:
         sight = self._views.newest
         if sight is None or self._flatness.is_proven or not self._uses_views:
             return None
-        self._body_frames = 0
-        if not self._is_same_camera:
-            return Body(sight.image, sight.frame_from_template, self.template.quad)
-        body = Body(self.template.picture, np.eye(3), self.template.quad)
-        body.take_over(sight.image, sight.template_points, sight.shown)
-        return body
+        return begun_body(self.template, sight, is_same_camera=self._is_same_camera)
 
     def _follow_body(self, body: Body, view: FrameView) -> Track | None:
         """The track of a target that is not flat; None if it is not seen near its last place."""
@@ -315,15 +309,12 @@ class HybridTracker:
         if self._frames_lost > _BODY_COAST_FRAMES:
             self._body = None
             return None
-        pose = body.follow(
-            view.frame.image, self._prediction.guess, was_lost=was_lost or self._body_frames == 0
-        )
+        pose = body.follow(view.frame.image, self._prediction.guess, was_lost=was_lost)
         if pose is None:
-            if self._body_frames == 0:
+            if not body.frames_seen:
                 self._body = None
             return None
-        self._body_frames += 1
-        if self._body_frames % _FRAMES_BETWEEN_PLANES == 1:
+        if body.frames_seen % _FRAMES_BETWEEN_PLANES == 1:
             plane = self._aligner.align(view, pose)
             if self._flatness.is_plane(agreeing_share(plane), plane.alike, plane.correlation):
                 self._body = None

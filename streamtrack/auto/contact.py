@@ -28,6 +28,7 @@ _CORE_SHARE = 0.75
 _ELDER_HITS = 10  # sightings of its own that make it a thing of its own
 _ALIKE_PX = 0.8  # grid pixels a frame, between motions of parts of one thing
 _DUPLICATE_OVERLAP = 0.75
+_MOST_JOINED = 25  # frames in a row in one blob, after which parts of it are parts of one thing
 _BESIDE = 0.3  # of a thing's box in another's, less than which they lie side by side
 _PORTRAIT_FRAMES = 3  # between two pictures of a thing
 _MOST_GUESSED = 10  # frames that a hidden thing goes on as before
@@ -93,6 +94,8 @@ def own_things(things: Sequence[Followed], moment: Moment) -> list[Followed]:
 
     Fragments were hardly ever seen alone, and move as the rest does.
     """
+    for thing in things:
+        thing.joined += 1
     elders = [thing for thing in things if _is_own(thing, things)]
     first = max(things, key=lambda thing: thing.hits)
     others = [
@@ -105,8 +108,12 @@ def _is_own(thing: Followed, beside: Sequence[Followed]) -> bool:
     """Was it seen alone, or for long beside the others, hardly over them?"""
     if thing.alone >= _ELDER_HITS:
         return True
-    return thing.hits >= _ELDER_HITS and all(
-        overlap(thing.box, other.box)[1] < _BESIDE for other in beside if other is not thing
+    return (
+        thing.hits >= _ELDER_HITS
+        and thing.joined < _MOST_JOINED
+        and all(
+            overlap(thing.box, other.box)[1] < _BESIDE for other in beside if other is not thing
+        )
     )
 
 

@@ -64,6 +64,7 @@ class Followed(HasBox):
     touches: bool = False
     alone: int = 0
     guessed: int = 0
+    joined: int = 0
     reason: str = ""
 
     @classmethod
@@ -119,7 +120,7 @@ class Followed(HasBox):
         self.path_px += float(np.hypot(*(self.center - before)))
         self.colors = self.colors + _COLOR_RATE * (blob.colors - self.colors)
         self.hits += 1
-        self.misses = self.guessed = 0
+        self.misses = self.guessed = self.joined = 0
 
     def resume(self, life: Life) -> None:
         """It was met with again; what has no name yet stays new."""

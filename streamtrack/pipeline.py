@@ -26,8 +26,10 @@ from streamtrack.targets import (
     check_quad_in_picture,
     given_targets,
 )
+from streamtrack.tracking.detect import DetectTracker
+from streamtrack.tracking.hybrid import HybridTracker
 from streamtrack.tracking.template import make_template
-from streamtrack.tracking.tracker import DetectTracker, HybridTracker, TargetTracker
+from streamtrack.tracking.tracker import TargetTracker
 from streamtrack.types import AUTO_STAGE, CameraPose, Frame, Step, Track
 from streamtrack.working_size import WorkingSize, graph_in_full_size
 from streamtrack.world import WorldMotion

@@ -10,6 +10,7 @@ import pytest
 
 from streamtrack import geometry
 from streamtrack.evaluation import corner_error
+from streamtrack.fitting import fit
 from streamtrack.mosaic import bundle
 from streamtrack.mosaic.adjustment import adjust
 from streamtrack.mosaic.types import Link
@@ -121,6 +122,35 @@ def test_without_noise_the_poses_are_exact() -> None:
     found = adjust(graph.start, graph.links, graph.sizes, 0)
     assert max(graph.errors(found.world_from_picture)) < 0.1
     assert found.rmse_px < 0.01
+
+
+def straight(count: int, tilt: float) -> Graph:
+    """A camera that flies straight on and tilts slowly; links and rough poses as measured."""
+    rng = np.random.default_rng(3)
+    unit = np.array([[1 / 320, 0, -1], [0, 1 / 320, -0.75], [0, 0, 1]])
+    truth, links, start = {}, [], {0: np.eye(3)}
+    for i in range(count):
+        change = np.eye(3)
+        change[2, :2] = tilt * np.sin(i / 9), tilt * np.cos(i / 13)
+        tilted = geometry.inverted(unit) @ change @ unit
+        truth[i] = geometry.translation(200.0 * i, 0) @ geometry.translation(-320, -240) @ tilted
+    first = geometry.inverted(truth[0])
+    truth = {i: geometry.normalized(first @ pose) for i, pose in truth.items()}
+    for b in range(count):
+        for a in range(b + 1, min(b + 3, count)):
+            one = link(a, b, between(truth, a, b), rng, 0.1)
+            own = fit(Model.HOMOGRAPHY, one.a_points, one.b_points)
+            links.append(linked(a, b, one.a_points, one.b_points, own))
+            if a == b + 1:
+                start[a] = geometry.normalized(start[b] @ own)
+    return Graph(truth, start, links)
+
+
+@pytest.mark.parametrize(("count", "tilt"), [(20, 0.003), (80, 0.01)])
+def test_a_long_way_is_not_bent_for_the_mean_of_slow_tilts(count: int, tilt: float) -> None:
+    graph = straight(count, tilt)
+    found = adjust(graph.start, graph.links, graph.sizes, 0, Model.HOMOGRAPHY, is_near=True)
+    assert max(graph.errors(found.world_from_picture)) < max(graph.errors(graph.start)) / 2
 
 
 def test_a_homography_does_not_drift_where_a_similarity_would_do() -> None:

@@ -18,6 +18,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from streamtrack.mosaic.prior import DEVIATION_ROWS, deviations, of_each_kind, prior_precisions
 from streamtrack.types import Mask, Model
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
@@ -30,7 +31,6 @@ _MIN_TOLERANCE_PX = 1.0  # links are never wrong for less than three times this
 _HUBER = 1.345  # times the noise: 95 % efficient for Gaussian errors
 _MIN_EXPOSURES = 0.25  # of the links
 _DENSE_UNKNOWNS = 240
-_PRIOR_FLOOR = 1e-5
 _DAMPING = 1e-9
 _MAX_DAMPING = 1e3
 
@@ -44,11 +44,6 @@ _FREEDOMS: dict[Model, Doubles] = {
     Model.AFFINE: np.eye(8)[:, :6],
     Model.HOMOGRAPHY: np.eye(8),
 }
-# Rows: how the four measures of `_deviations` change with D.
-_DEVIATION_ROWS = np.zeros((4, 8))
-_DEVIATION_ROWS[0, [0, 4]] = 1.0, -1.0
-_DEVIATION_ROWS[1, [1, 3]] = 1.0
-_DEVIATION_ROWS[2, 6] = _DEVIATION_ROWS[3, 7] = 1.0
 _SIMILARITY_ROWS = np.linalg.pinv(_FREEDOMS[Model.SIMILARITY])
 
 
@@ -92,6 +87,21 @@ class Problem:
         pairs = np.maximum(_of_links(self.counts.sum(axis=1)), 1)
         tells: Mask = np.sqrt(squares / pairs) > MIN_NOISE_PX
         return tells if np.mean(tells) > _MIN_EXPOSURES else np.ones_like(tells)
+
+    @cached_property
+    def _noise_gains(self) -> Doubles:
+        """Variances (4,) of `deviations` in the links' own mappings for noise of 1 px."""
+        _, by_a, _ = _change_of_points(self, self.own)
+        weighted = by_a * self.counts[..., None, None]
+        normal = np.einsum("lkic,lkid->lcd", weighted, by_a)
+        both = _of_links(normal) + 1e-9 * np.eye(8)
+        covariance = DEVIATION_ROWS @ np.linalg.inv(both) @ DEVIATION_ROWS.T
+        usual = np.median(np.diagonal(covariance, axis1=1, axis2=2), axis=0)
+        return of_each_kind(usual)
+
+    def noise_variances(self, noise_px: float) -> Doubles:
+        """Of the four measures of `prior.deviations` in the links' own mappings, (4,)."""
+        return self._noise_gains * noise_px**2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,20 +232,13 @@ def _weights(problem: Problem, poses: Doubles, errors: Doubles, rejection: _Reje
         huber = np.nan_to_num(np.minimum(1.0, 2 * _HUBER * noise_px / alone))
     of_link = rejection.weights(errors)
     pairs = huber * problem.counts * np.concatenate([of_link, of_link])[:, None] / noise_px**2
-    absolute = _variances(poses, problem.unit_from_picture)
-    relative = _variances(problem.own, problem.unit_from_picture[problem.a])
-    return _Weights(pairs, 1 / (np.maximum(absolute, relative) + _PRIOR_FLOOR**2))
-
-
-def _variances(poses: Doubles, unit_from_picture: Doubles) -> Doubles:
-    """Mean squares (4,) of what poses have beyond similarities, the farthest tenth left out.
-
-    Both measures of a kind get one: a camera turned by 90 degrees is no other camera.
-    """
-    squares = _deviations(poses, unit_from_picture) ** 2
-    kept = np.sort(squares, axis=0)[: max(1, round(0.9 * len(squares)))]
-    variances = kept.mean(axis=0)
-    return np.repeat([np.mean(variances[:2]), np.mean(variances[2:])], 2)
+    unit = problem.unit_from_picture
+    precisions = prior_precisions(
+        deviations(poses, unit),
+        deviations(problem.own, unit[problem.a]),
+        problem.noise_variances(noise_px),
+    )
+    return _Weights(pairs, precisions)
 
 
 def _cost(
@@ -244,25 +247,8 @@ def _cost(
     is_counted = weights.pairs > 0
     cost = float(np.sum(weights.pairs[is_counted] * errors[is_counted] ** 2))
     if model in (Model.AFFINE, Model.HOMOGRAPHY):
-        cost += float(np.sum(_deviations(poses, problem.unit_from_picture) ** 2 * weights.prior))
+        cost += float(np.sum(deviations(poses, problem.unit_from_picture) ** 2 * weights.prior))
     return cost if np.isfinite(cost) else float("inf")
-
-
-def _deviations(poses: Doubles, unit_from_picture: Doubles) -> Doubles:
-    """What each pose (n, 4) has beyond a similarity: aspect, shear, and perspective along x and y.
-
-    In unit coordinates, at the picture's centre.
-    """
-    local = poses @ np.linalg.inv(unit_from_picture)
-    corner = local[:, 2, 2]
-    linear = local[:, :2, :2] / corner[:, None, None]
-    linear = linear - local[:, :2, 2:] * local[:, 2:, :2] / corner[:, None, None] ** 2
-    metric = linear.transpose(0, 2, 1) @ linear
-    trace = metric[:, 0, 0] + metric[:, 1, 1]
-    aspect = (metric[:, 0, 0] - metric[:, 1, 1]) / trace
-    shear = 2 * metric[:, 0, 1] / trace
-    bend = local[:, 2, :2] / corner[:, None]
-    return np.stack([aspect, shear, bend[:, 0], bend[:, 1]], axis=1)
 
 
 def _relative(problem: Problem, poses: Doubles) -> Doubles:
@@ -296,9 +282,13 @@ def transfer_errors_of(problem: Problem, b_from_a: Doubles) -> Doubles:
 def _jacobians(problem: Problem, poses: Doubles, model: Model) -> tuple[Doubles, Doubles, Doubles]:
     """Residuals b - mapped (2 L, K, 2), and how mapped points change with both poses' freedoms."""
     freedoms = _FREEDOMS[model]
-    b_from_a = _relative(problem, poses)
+    mapped, by_a, by_b = _change_of_points(problem, _relative(problem, poses))
+    return problem.b_points - mapped, by_a @ freedoms, by_b @ freedoms
+
+
+def _change_of_points(problem: Problem, b_from_a: Doubles) -> tuple[Doubles, Doubles, Doubles]:
+    """Mapped points (2 L, K, 2), and how they change with D of a's and of b's pose (.., 8)."""
     mapped, depth = _mapped(problem, b_from_a)
-    residuals = problem.b_points - mapped
     unit_a, unit_b = problem.unit_from_picture[problem.a], problem.unit_from_picture[problem.b]
 
     # d mapped = d pi(h) B^-1 A N^-1 (D N p), with (D N p) linear in D's elements.
@@ -318,7 +308,7 @@ def _jacobians(problem: Problem, poses: Doubles, model: Model) -> tuple[Doubles,
     rows_u = np.stack([u, v, one, zero, zero, zero, -u * u, -u * v], axis=-1)
     rows_v = np.stack([zero, zero, zero, u, v, one, -u * v, -v * v], axis=-1)
     by_b = -np.stack([rows_u, rows_v], axis=-2) / factor[:, None, None, None]
-    return residuals, by_a @ freedoms, by_b @ freedoms
+    return mapped, by_a, by_b
 
 
 def _step(
@@ -345,9 +335,9 @@ def _step(
     np.add.at(vector, problem.a, (ja_t @ r)[..., 0])
     np.add.at(vector, problem.b, (jb_t @ r)[..., 0])
     if model in (Model.AFFINE, Model.HOMOGRAPHY):
-        prior = _DEVIATION_ROWS @ freedoms
+        prior = DEVIATION_ROWS @ freedoms
         diagonal += prior.T @ (weights.prior[:, None] * prior)
-        vector -= (_deviations(poses, problem.unit_from_picture) * weights.prior) @ prior
+        vector -= (deviations(poses, problem.unit_from_picture) * weights.prior) @ prior
     if problem.anchor is not None:
         pin = _SIMILARITY_ROWS @ freedoms
         strength = 1e3 * max(1.0, float(np.max(diagonal)))

@@ -326,6 +326,37 @@ def test_of_two_that_disagree_the_one_without_an_outline_is_the_ground(
     assert choice is not None and choice.tally.undecided > 80 * 90
 
 
+def noisy_road(rng: np.random.Generator) -> Image:
+    road = 60 + rng.normal(0, 2, (256, 256))
+    road[120:124] += 60
+    return np.clip(road, 0, 255).astype(np.uint8)
+
+
+def test_of_many_samples_one_that_is_hardly_darker_loses_too() -> None:
+    rng = np.random.default_rng(1)
+    images = [noisy_road(rng) for _ in range(12)]
+    images[0][40:100, 40:140] -= 12
+    picture, _ = chosen([bgrw(image, 255 if n == 0 else 40) for n, image in enumerate(images)])
+    assert abs(float(picture[44:96, 44:136, 0].mean()) - 60) < 1
+    assert np.array_equal(picture[160:, :, 0], images[0][160:])
+
+
+def test_a_busy_road_is_empty_in_the_end() -> None:
+    rng = np.random.default_rng(2)
+    samples = []
+    for _ in range(15):
+        image = noisy_road(rng)
+        for _ in range(4):
+            x, y = rng.integers(0, 190), rng.integers(0, 220)
+            image[y : y + 36, x : x + 66] = rng.choice([15, 40, 90, 150, 230])
+            image[y + 8 : y + 28, x + 16 : x + 50] = rng.choice([30, 70, 120, 200])
+        samples.append(bgrw(image))
+    picture, _ = chosen(samples)
+    empty = np.full((256, 256), 60.0)
+    empty[120:124] += 60
+    assert np.mean(np.abs(picture[..., 0] - empty) > 15) < 0.005
+
+
 def test_what_is_shut_out_has_a_smooth_outline(make_picture: MakePicture) -> None:
     """A round thing in one of five samples: stairs of cells would be 1.27 times as long."""
     ground = make_picture(3, (256, 256))

@@ -11,7 +11,7 @@ from streamtrack.fitting import fit
 from streamtrack.types import Matrix, Model, Points
 
 _FIRST_SURPRISE_PX = 5.0
-_RATE = 0.2  # share of a new frame in the running means
+_RATE = 0.2  # share of a new frame in the running means; more in the first few
 
 
 class Prediction:
@@ -27,6 +27,7 @@ class Prediction:
         self.pose = pose
         self._steps: list[Matrix] = []
         self._off_px = [_FIRST_SURPRISE_PX] * 3
+        self._judged = [1] * 3
         self._guesses: list[Matrix] = []
 
     @property
@@ -68,7 +69,9 @@ class Prediction:
         if is_clear:
             for order, guess in enumerate(self._all_guesses()):
                 off_px = _rms_px(geometry.transform_points(guess, self._quad) - after)
-                self._off_px[order] += _RATE * (off_px - self._off_px[order])
+                self._judged[order] += 1
+                rate = max(_RATE, 1 / self._judged[order])
+                self._off_px[order] += rate * (off_px - self._off_px[order])
         # Few freedoms extrapolate well; those of perspective would mostly extrapolate noise.
         # Poses with hidden corners would make a change of motion run away.
         kept = self._steps[-1:] if is_clear else []

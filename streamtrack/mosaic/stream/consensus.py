@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack.mosaic.stream.painting import FEATHER, disagreement, quartered
-from streamtrack.mosaic.stream.voting import vote
+from streamtrack.mosaic.stream.voting import MANY, vote
 from streamtrack.types import Image, Mask, Size
 
 _STOOD_BACK = np.where(np.arange(256) > 0, np.maximum(np.arange(256) // 6, 1), 0).astype(np.uint8)
@@ -158,7 +158,7 @@ class Chooser:
         covered = self._small[: len(self), :-_GAP, :, 3] > 0
         times = covered.sum(axis=0, dtype=np.int16)
         overlap = int(np.count_nonzero(times > 1)) * 16
-        if not self._differs:
+        if not self._differs and len(self) < MANY:
             return Choice(tuple(self._samples), tuple(weights), Tally(overlap))
         votes = vote(self._small[: len(self), :-_GAP], self._differs, self._moments)
         judged = [

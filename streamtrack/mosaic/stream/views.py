@@ -1,8 +1,9 @@
 """The frames that a mosaic keeps, so that any part of it can be painted again.
 
 A frame is kept if it sees something new, or if the places it sees want another sample: about
-`SAMPLES` of each place, spread over time, tell what stands there from what only passes by. Those
-that nothing needs any more are dropped, so the store grows with the area seen, not with time.
+`SAMPLES` of each place, spread over time, tell what stands there from what only passes by; where
+a camera stays for long, and much may pass by, up to `MOST_SAMPLES`. Those that nothing needs any
+more are dropped, so the store grows with the area seen, not with time.
 """
 
 from __future__ import annotations
@@ -18,13 +19,14 @@ from streamtrack import geometry
 from streamtrack.mosaic import gains
 from streamtrack.mosaic.spill import Slot, SpillFile
 from streamtrack.mosaic.stream import painting
-from streamtrack.mosaic.stream.coverage import CellGrid, Footprint, footprint
+from streamtrack.mosaic.stream.coverage import CellGrid, Footprint, Values, footprint
 from streamtrack.mosaic.stream.tiles import TILE, TileKey
 from streamtrack.types import Frame, Image, Matrix, Points, Size
 
-SAMPLES = 5
-"""Samples of each place that are wanted."""
+SAMPLES, MOST_SAMPLES = 5, 15
+"""Samples that are wanted of each place, and of one that is looked at for long."""
 
+_FRAMES_A_SAMPLE = 30  # in view, for which another sample is wanted
 _SPARE = 2
 _LEAST_LEFT = 3
 _CROWDED_SHARE = 0.7
@@ -106,7 +108,7 @@ class ViewStore:
         counts = self._counts.read(cells)[seen]
         since_last = moment + 1 - self._last.read(cells)[seen]
         age = moment + 1 - self._first.read(cells)[seen]
-        gap = np.maximum(_MIN_GAP, age // SAMPLES)
+        gap = np.maximum(_MIN_GAP, age // _wanted_samples(age))
         wanted = (counts > 0) & (since_last >= gap)
         return Need(
             float(np.count_nonzero(counts == 0)) / total, float(np.count_nonzero(wanted)) / total
@@ -171,7 +173,8 @@ class ViewStore:
         """Drop views near ``around`` that no place needs; returns them."""
         dropped: list[View] = []
         while True:
-            crowded = self._counts.read(around.cells)[around.cells.seen] > SAMPLES + _SPARE
+            most = self._wanted(around.cells, around.moment) + _SPARE
+            crowded = self._counts.read(around.cells)[around.cells.seen] > most
             if not crowded.any():
                 return dropped
             view = self._least_needed(around)
@@ -193,7 +196,8 @@ class ViewStore:
     def _least_needed(self, around: View) -> View | None:
         """The view that all its places can spare and whose neighbours in time are nearest."""
         near = sorted(self.neighbours(around), key=lambda view: view.moment)
-        spare = [view for view in near if view is not around and self._can_spare(view)]
+        now = around.moment
+        spare = [view for view in near if view is not around and self._can_spare(view, now)]
         moments = np.array([view.moment for view in near])
 
         def gap(view: View) -> int:
@@ -204,10 +208,14 @@ class ViewStore:
 
         return min(spare, key=gap, default=None)
 
-    def _can_spare(self, view: View) -> bool:
+    def _can_spare(self, view: View, now: int) -> bool:
         counts = self._counts.read(view.cells)[view.cells.seen]
-        crowded = np.count_nonzero(counts > SAMPLES)
+        crowded = np.count_nonzero(counts > self._wanted(view.cells, now))
         return bool((counts > _LEAST_LEFT).all() and crowded >= _CROWDED_SHARE * len(counts))
+
+    def _wanted(self, cells: Footprint, now: int) -> Values:
+        """How many samples the cells that a footprint sees want at a moment, (N,)."""
+        return _wanted_samples(now + 1 - self._first.read(cells)[cells.seen])
 
     def neighbours(self, view: View) -> list[View]:
         """The other views that may overlap it."""
@@ -256,6 +264,11 @@ class ViewStore:
             self._by_tile[key].discard(view.number)
 
 
+def _wanted_samples(age: Values) -> Values:
+    """Samples wanted of places (N,) first seen so many frames ago."""
+    return np.clip(age // _FRAMES_A_SAMPLE, SAMPLES, MOST_SAMPLES)
+
+
 def _nearest(view: View, others: Sequence[View]) -> Iterable[View]:
     """The few whose centres are nearest: they overlap most."""
     x, y = view.centre
@@ -266,5 +279,5 @@ def _nearest(view: View, others: Sequence[View]) -> Iterable[View]:
     return sorted(others, key=distance)[:_NEIGHBOURS]
 
 
-def _first_moments(first: np.typing.NDArray[np.int32], moment: int) -> np.typing.NDArray[np.int32]:
+def _first_moments(first: Values, moment: int) -> Values:
     return np.where(first == 0, np.int32(moment), first)

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from streamtrack.types import Image, Mask
 
 _CALM = 9
-_CLOSE_VOTE = 0.6
+_CLOSE_VOTE, _CLOSE_BY = 0.6, 3.0  # votes of the leader's, or fewer by so many: of many, more
 _MOST_SPAN = 4.0
 _CLEARLY, _VERY_CLEARLY = 1.15, 1.4
 _AROUND_LEVELS = 16.0
@@ -31,6 +31,8 @@ _LEAST_NEAR = 0.12
 _LEAST_CELLS = 16
 _EDGE = 4  # cells around a dispute that are looked at
 _MOST_DISPUTES = 12
+MANY = 9  # samples that agree, whose scatter tells how far off one may be
+_LEAST_OFF, _MOST_OFF = 8.0, 6.0  # levels, and times the median distance from the middle one
 _KERNEL_3, _KERNEL_7 = (np.ones((side, side), np.uint8) for side in (3, 7))
 
 Floats: TypeAlias = npt.NDArray[np.float32]
@@ -73,8 +75,37 @@ def vote(samples: Image, differs: Differs, moments: Sequence[int]) -> Votes:
     for (a, b), mask in differs.items():
         outliers[b] |= mask & (leader == a)
         outliers[a] |= mask & (leader == b)
+    if len(samples) >= MANY:
+        outliers = _with_odd_ones(samples, outliers)
     undecided = contested & (2 * support.max(axis=0) <= 1.001 * times)
     return Votes(outliers, int(np.count_nonzero(contested)), int(np.count_nonzero(undecided)))
+
+
+def _with_odd_ones(samples: Image, outliers: list[Mask]) -> list[Mask]:
+    """Where many samples (n, h, w, 4) agree, those too that differ by more than these scatter.
+
+    A dark car on a dark road differs by less than two views of one place may. The limit is six
+    times the median distance from the median, about nine standard deviations.
+    """
+    colours = np.stack([cv2.blur(sample[..., :3], (3, 3)) for sample in samples]).astype(np.int16)
+    is_out = np.stack(outliers) | (samples[..., 3] == 0)
+    count = len(samples) - np.count_nonzero(is_out, axis=0)
+    off = np.abs(colours - _middle(colours, is_out, count))
+    limit = np.maximum(_LEAST_OFF, _MOST_OFF * _middle(off, is_out, count))
+    is_odd = (off > limit).any(axis=3) & (count >= MANY)
+    odd = [cv2.morphologyEx(one.view(np.uint8), cv2.MORPH_OPEN, _KERNEL_3) for one in is_odd]
+    return [
+        mask | (cv2.dilate(one, _KERNEL_3) > 0) for mask, one in zip(outliers, odd, strict=True)
+    ]
+
+
+def _middle(
+    values: npt.NDArray[np.int16], is_out: Mask, count: npt.NDArray[np.intp]
+) -> npt.NDArray[np.int16]:
+    """Median (h, w, 3) over the samples (n, h, w, 3) that are not out, ``count`` (h, w) of them."""
+    ordered = np.sort(np.where(is_out[..., None], np.int16(999), values), axis=0)
+    row = np.clip(count // 2, 0, len(values) - 1)
+    return np.asarray(np.take_along_axis(ordered, row[None, ..., None], axis=0)[0])
 
 
 def _spans(moments: Sequence[int]) -> Floats:
@@ -106,27 +137,23 @@ def _settle_close_votes(
             pair, votes = (samples[rival], samples[first]), (support[rival], support[first])
             # A thing may have several leaders: a part of it is judged with the whole as well.
             for roi, part in _parts(seen & is_first & (leader == first)):
-                if _is_won(pair, votes, roi, part, mask, _CLEARLY):
+                is_close = _is_close(votes, roi, part, len(samples))
+                if is_close and _is_ground(pair[0][roi], pair[1][roi], part, mask[roi], _CLEARLY):
                     leader[roi][part] = rival
             for roi, whole in _parts(seen):
                 led = whole & is_first[roi] & (leader[roi] == first)
-                if led.any() and _is_won(pair, votes, roi, whole, mask, _VERY_CLEARLY):
+                is_close = led.any() and _is_close(votes, roi, led, len(samples))
+                one, other = pair[0][roi], pair[1][roi]
+                if is_close and _is_ground(one, other, whole, mask[roi], _VERY_CLEARLY):
                     leader[roi][led] = rival
 
 
-def _is_won(
-    pair: tuple[Image, Image],
-    votes: tuple[Floats, Floats],
-    roi: tuple[slice, slice],
-    inside: Mask,
-    disputed: Mask,
-    clearly: float,
+def _is_close(
+    votes: tuple[Floats, Floats], roi: tuple[slice, slice], inside: Mask, count: int
 ) -> bool:
-    """Whether the first of a pair has nearly as many votes in a part, and shows the ground."""
+    """Whether the first of a pair, of so many samples, has nearly as many votes in a part."""
     one, other = (float(np.median(some[roi][inside])) for some in votes)
-    if one < _CLOSE_VOTE * other:
-        return False
-    return _is_ground(pair[0][roi], pair[1][roi], inside, disputed[roi], clearly)
+    return one >= max(_CLOSE_VOTE, 1 - _CLOSE_BY / count) * other
 
 
 def _parts(mask: Mask) -> Iterator[tuple[tuple[slice, slice], Mask]]:

@@ -708,8 +708,9 @@ def test_rtsp_delivers_pictures_and_decodable_packets(start_rtsp: RtspStarter) -
     assert (info.size_wh, info.rate_hz, info.packet_codec) == ((320, 240), 30.0, "h264")
     assert len(pictures) == 45
     assert -0.001 < now - pictures[-1].captured_s < 0.3
-    steps = np.diff([p.time_s for p in pictures[5:]])
-    np.testing.assert_allclose(steps, 1 / 30, atol=0.002)
+    steps = np.diff([p.time_s for p in pictures[5:]]) * 30
+    assert np.median(steps) == pytest.approx(1, abs=0.06)  # a loaded server leaves frames out
+    np.testing.assert_allclose(steps, np.rint(steps), atol=0.06)
     # The parameter sets were in the answer to DESCRIBE only; each keyframe carries them now.
     packets = [packet for p in pictures for packet in p.packets]
     keyframes = [packet for packet in packets if packet.is_keyframe]

@@ -32,7 +32,8 @@ from streamtrack.camera.view_levels import (
 )
 from streamtrack.camera.view_verdict import Fitted, ViewAlignment, judged, refusal
 from streamtrack.registration import judge_mapping
-from streamtrack.types import Image, Matrix, Points, Verdict
+from streamtrack.types import Image, Matrix, Model, Points, Verdict
+from streamtrack.uncertainty import MODEL_BASES
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
@@ -50,10 +51,7 @@ _MAX_STIFF_UNLIKE = 1.25  # and the factor by which they may be less alike
 _NEAR_SHARE = 0.015  # of the view: as far a guess may be off where coarse levels are left out
 _SEARCH_SHARE = 0.3  # of the view: how far the search for a shift reaches
 
-_SIMILARITY = np.stack(
-    [np.eye(8)[2], np.eye(8)[5], np.eye(8)[0] + np.eye(8)[4], np.eye(8)[3] - np.eye(8)[1]], axis=1
-)
-_AFFINE = np.eye(8)[:, :6]
+_SIMILARITY, _AFFINE = MODEL_BASES[Model.SIMILARITY], MODEL_BASES[Model.AFFINE]
 _FREEDOMS = (np.eye(8), np.eye(8), _AFFINE, _SIMILARITY, _SIMILARITY)  # by level
 
 

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from streamtrack.mosaic.prior import DEVIATION_ROWS, deviations, of_each_kind, prior_precisions
 from streamtrack.types import Mask, Model
+from streamtrack.uncertainty import MODEL_BASES
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 Rows: TypeAlias = npt.NDArray[np.intp]
@@ -34,17 +35,7 @@ _DENSE_UNKNOWNS = 240
 _DAMPING = 1e-9
 _MAX_DAMPING = 1e3
 
-# Columns: changes D of a pose, rows h11 .. h32 of D, that a model allows.
-_FREEDOMS: dict[Model, Doubles] = {
-    Model.TRANSLATION: np.eye(8)[:, [2, 5]],
-    Model.SIMILARITY: np.stack(
-        [np.eye(8)[2], np.eye(8)[5], np.eye(8)[0] + np.eye(8)[4], np.eye(8)[3] - np.eye(8)[1]],
-        axis=1,
-    ),
-    Model.AFFINE: np.eye(8)[:, :6],
-    Model.HOMOGRAPHY: np.eye(8),
-}
-_SIMILARITY_ROWS = np.linalg.pinv(_FREEDOMS[Model.SIMILARITY])
+_SIMILARITY_ROWS = np.linalg.pinv(MODEL_BASES[Model.SIMILARITY])
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,7 +272,7 @@ def transfer_errors_of(problem: Problem, b_from_a: Doubles) -> Doubles:
 
 def _jacobians(problem: Problem, poses: Doubles, model: Model) -> tuple[Doubles, Doubles, Doubles]:
     """Residuals b - mapped (2 L, K, 2), and how mapped points change with both poses' freedoms."""
-    freedoms = _FREEDOMS[model]
+    freedoms = MODEL_BASES[model]
     mapped, by_a, by_b = _change_of_points(problem, _relative(problem, poses))
     return problem.b_points - mapped, by_a @ freedoms, by_b @ freedoms
 
@@ -315,7 +306,7 @@ def _step(
     problem: Problem, poses: Doubles, weights: _Weights, model: Model, damping: float
 ) -> Doubles:
     """The change D (n, 8) of every pose that minimises the linearised cost."""
-    freedoms = _FREEDOMS[model]
+    freedoms = MODEL_BASES[model]
     k, count = freedoms.shape[1], len(poses)
     residuals, by_a, by_b = _jacobians(problem, poses, model)
     links, pairs = problem.counts.shape

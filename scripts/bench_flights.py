@@ -4,7 +4,8 @@
 
 Several photographs are laid side by side in rows. A virtual camera flies a rounded rectangle over
 them and comes back to its start, with rotation of 6 degrees and zoom of 8 per cent either way,
-slight perspective, noise of sigma 2 and gain of 8 per cent either way. Errors are mean distances
+slight perspective, noise of sigma 2 and gain of 8 per cent either way. Whole laps are flown, one at
+least, so that the true step may differ from --step; it is printed. Errors are mean distances
 of a frame's four corners from the truth, in pixels of the first frame, which is the world; nothing
 is aligned afterwards.
 """
@@ -72,16 +73,31 @@ class Flight:
         turned = np.array([[c * half, -s * half, x], [s * half, c * half, y], [0, 0, 1]])
         return geometry.normalized(turned @ bend @ unit)
 
-    def _place(self, run: float) -> tuple[float, float]:
-        """The middle of the view after ``run`` px on a rectangle with rounded corners."""
+    @property
+    def _course(self) -> tuple[float, tuple[float, float], float]:
+        """Margin, straight parts along both sides and radius of the corners."""
         height, width = self.photo.shape[:2]
         margin = 0.5 * math.hypot(*self.size_wh) * (1 + _ZOOM) * 1.03
         w, h = width - 2 * margin, height - 2 * margin
         radius = 0.35 * min(w, h)
-        straight_w, straight_h, arc = w - 2 * radius, h - 2 * radius, 0.5 * math.pi * radius
-        lap = 2 * (straight_w + straight_h) + 4 * arc
-        laps = max(1, round(self.frames * self.step_px / lap))
-        run = run * laps * lap / (self.frames * self.step_px) % lap
+        return margin, (w - 2 * radius, h - 2 * radius), radius
+
+    @property
+    def _lap_px(self) -> float:
+        _, straights, radius = self._course
+        return 2 * sum(straights) + 2 * math.pi * radius
+
+    @property
+    def true_step_px(self) -> float:
+        """The step with which whole laps are flown, one at least."""
+        laps = max(1, round(self.frames * self.step_px / self._lap_px))
+        return laps * self._lap_px / self.frames
+
+    def _place(self, run: float) -> tuple[float, float]:
+        """The middle of the view after ``run`` px on a rectangle with rounded corners."""
+        margin, (straight_w, straight_h), radius = self._course
+        arc = 0.5 * math.pi * radius
+        run = run * self.true_step_px / self.step_px % self._lap_px
         x, y, heading = margin + radius, margin, 0.0
         for length in (straight_w, straight_h, straight_w, straight_h):
             part = min(run, length)
@@ -210,6 +226,7 @@ def main() -> None:
         arguments.seed,
     )
     outcome = fly(flight)
+    print(f"step : {flight.true_step_px:.1f} px a frame")
     for name, errors in (("live", outcome.live_px), ("final", outcome.final_px)):
         known = errors[np.isfinite(errors)]
         end = errors[-1]

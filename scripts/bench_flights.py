@@ -60,7 +60,7 @@ class Flight:
             return math.sin(laps * turn + phases[which])
 
         width, height = self.size_wh
-        x, y = self._place(index * self.step_px)
+        x, y = self._place(index * self.true_step_px)
         angle = math.radians(_ROLL_DEG) * 0.5 * (wave(0, 3) + wave(1, 5))
         scale = 1 + _ZOOM * 0.5 * (wave(2, 2) + wave(3, 7))
         c, s = scale * math.cos(angle), scale * math.sin(angle)
@@ -97,7 +97,7 @@ class Flight:
         """The middle of the view after ``run`` px on a rectangle with rounded corners."""
         margin, (straight_w, straight_h), radius = self._course
         arc = 0.5 * math.pi * radius
-        run = run * self.true_step_px / self.step_px % self._lap_px
+        run %= self._lap_px
         x, y, heading = margin + radius, margin, 0.0
         for length in (straight_w, straight_h, straight_w, straight_h):
             part = min(run, length)

@@ -44,6 +44,12 @@ def resized(picture: Image, size_wh: Size) -> Image:
     return np.asarray(cv2.resize(picture, size_wh, interpolation=cv2.INTER_AREA), np.uint8)
 
 
+def reduced(picture: Image, factor: float) -> Image:
+    """The picture, uint8, with its sides times a factor of at most 1, a pixel at least."""
+    height, width = picture.shape[:2]
+    return resized(picture, (max(1, round(width * factor)), max(1, round(height * factor))))
+
+
 class WorkingSize:
     """Makes the frames and targets of one run smaller, and its results large again."""
 

@@ -15,11 +15,10 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.camera.view_alignment import align
-from streamtrack.camera.view_levels import USUAL, Floats, ReferenceView, ViewLevels
+from streamtrack.camera.view_levels import USUAL, Floats, ReferenceView, ViewLevels, filled
 from streamtrack.camera.view_verdict import ViewAlignment
 from streamtrack.types import Mask, Matrix, Points, Verdict
 
@@ -128,10 +127,7 @@ class _Compared:
         self._level_from_reference = reference.levels.level_from_view(USUAL)
         self._view_from_level = geometry.inverted(view.level_from_view(USUAL))
         self._energy = cv2.blur(self._wanted * self._wanted, _WINDOW)
-        shown = np.ones(self._wanted.shape, np.uint8)
-        for quad in reference.hidden:
-            cv2.fillConvexPoly(shown, self._outline(quad), 0)
-        self._shown = shown > 0
+        self._shown = ~filled(reference.hidden, self._level_from_reference, self._wanted.shape)
 
     def under(self, reference_from_view: Matrix) -> _Under:
         """The view under a mapping, compared with the reference."""
@@ -179,7 +175,3 @@ class _Compared:
         return tuple(
             geometry.transform_points(reference_from_level, cv2.boxPoints(b)) for b in grown
         )
-
-    def _outline(self, quad: Points) -> npt.NDArray[np.int32]:
-        there = geometry.transform_points(self._level_from_reference, quad)
-        return np.rint(np.clip(there, -1e6, 1e6)).astype(np.int32)

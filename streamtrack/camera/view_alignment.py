@@ -29,10 +29,11 @@ from streamtrack.camera.view_levels import (
     Pixels,
     ReferenceView,
     ViewLevels,
+    filled,
 )
 from streamtrack.camera.view_verdict import Fitted, ViewAlignment, judged, refusal
 from streamtrack.registration import judge_mapping
-from streamtrack.types import Image, Matrix, Model, Points, Verdict
+from streamtrack.types import Mask, Matrix, Model, Points, Verdict
 from streamtrack.uncertainty import MODEL_BASES
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
@@ -216,8 +217,8 @@ def _fit(
     values = view.high_passed(level)
     to_reference, to_view = reference.levels.level_from_view(level), view.level_from_view(level)
     mapping = to_view @ start @ geometry.inverted(to_reference)
-    outlines = [geometry.transform_points(to_view, quad) for quad in hidden]
-    pixels = _in_view(reference.pixels(level), mapping, values.shape, EDGE_PX[level], outlines)
+    covered = filled(hidden, to_view, values.shape) if hidden else None
+    pixels = _in_view(reference.pixels(level), mapping, values.shape, EDGE_PX[level], covered)
     if len(pixels.values) < _LEAST_PIXELS[level]:
         return None
     basis = _FREEDOMS[level] if basis is None else basis
@@ -294,15 +295,15 @@ def _in_view(
     mapping: Matrix,
     shape: tuple[int, ...],
     edge: int,
-    outlines: Sequence[Points],
+    covered: Mask | None,
 ) -> Pixels:
-    """Those of the pixels that the view shows, off its edge and outside the outlines (4, 2)."""
+    """Those of the pixels that the view shows, off its edge and where (h, w) it is not covered."""
     x, y, depth = _projected(mapping, pixels.points)
     height, width = shape
     inside = (x >= edge) & (y >= edge) & (x < width - 1 - edge) & (y < height - 1 - edge)
     inside &= depth > 0
-    if outlines:
-        inside[inside] = _filled(outlines, shape)[_rounded(y[inside]), _rounded(x[inside])] == 0
+    if covered is not None:
+        inside[inside] = ~covered[_rounded(y[inside]), _rounded(x[inside])]
     if inside.all():
         return pixels
     rows = np.flatnonzero(inside)
@@ -320,15 +321,6 @@ def _projected(mapping: Matrix, points: Floats) -> tuple[Floats, Floats, Floats]
     moved = mapping.astype(np.float32) @ points
     with np.errstate(divide="ignore", invalid="ignore"):
         return moved[0] / moved[2], moved[1] / moved[2], moved[2]
-
-
-def _filled(outlines: Sequence[Points], shape: tuple[int, ...]) -> Image:
-    """A picture (h, w) that is 1 inside the quads (4, 2)."""
-    filled = np.zeros(shape, np.uint8)
-    for outline in outlines:
-        if np.isfinite(outline).all():
-            cv2.fillConvexPoly(filled, np.rint(np.clip(outline, -1e4, 1e4)).astype(np.int32), 1)
-    return filled
 
 
 def _rounded(values: Floats) -> npt.NDArray[np.intp]:

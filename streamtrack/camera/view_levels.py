@@ -127,6 +127,16 @@ class ReferenceView:
         return self._pixels[level]
 
 
+def filled(quads: Sequence[Points], picture_from_view: Matrix, shape: tuple[int, ...]) -> Mask:
+    """Which pixels (h, w) of a picture lie in quads (4, 2) of a view; not finite ones are none."""
+    inside = np.zeros(shape, np.uint8)
+    for quad in quads:
+        seen = geometry.transform_points(picture_from_view, quad)
+        if np.isfinite(seen).all():
+            cv2.fillConvexPoly(inside, np.rint(np.clip(seen, -1e6, 1e6)).astype(np.int32), 1)
+    return inside > 0
+
+
 def _choose_pixels(
     levels: ViewLevels, level: int, hidden: Sequence[Points], masked: Mask | None
 ) -> Pixels:
@@ -137,11 +147,7 @@ def _choose_pixels(
     edge = EDGE_PX[level]
     strength[:edge] = strength[-edge:] = 0
     strength[:, :edge] = strength[:, -edge:] = 0
-    for quad in hidden:
-        seen = geometry.transform_points(levels.level_from_view(level), quad)
-        if np.isfinite(seen).all():
-            outline = np.rint(np.clip(seen, -1e6, 1e6)).astype(np.int32)
-            cv2.fillConvexPoly(strength, outline, 0.0)
+    strength[filled(hidden, levels.level_from_view(level), values.shape)] = 0
     if masked is not None:
         size = values.shape[1], values.shape[0]
         spread = cv2.resize(masked.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)

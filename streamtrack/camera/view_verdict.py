@@ -17,6 +17,7 @@ from streamtrack import geometry
 from streamtrack.camera.view_levels import USUAL, Floats, Pixels, ReferenceView, ViewLevels
 from streamtrack.registration import judge_mapping
 from streamtrack.types import Mask, Matrix, Points, Size, Verdict
+from streamtrack.uncertainty import motion_rows
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
@@ -184,10 +185,7 @@ def _corner_sigma_px(
     unit = geometry.transform_points(to_unit, corners).astype(np.float64)
     if not np.isfinite(unit).all():
         return float("inf")
-    x, y = unit.T
-    one, zero = np.ones(4), np.zeros(4)
-    rows_x = np.stack([x, y, one, zero, zero, zero, -x * x, -x * y], axis=1)
-    rows_y = np.stack([zero, zero, zero, x, y, one, -x * y, -y * y], axis=1)
+    rows_x, rows_y = motion_rows(unit).reshape(4, 2, 8).transpose(1, 0, 2)
     try:
         covariance = fitted.basis @ np.linalg.inv(fitted.normal) @ fitted.basis.T
     except np.linalg.LinAlgError:

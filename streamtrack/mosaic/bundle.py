@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from streamtrack.mosaic.prior import DEVIATION_ROWS, deviations, of_each_kind, prior_precisions
 from streamtrack.types import Mask, Model
-from streamtrack.uncertainty import MODEL_BASES
+from streamtrack.uncertainty import MODEL_BASES, motion_rows
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 Rows: TypeAlias = npt.NDArray[np.intp]
@@ -294,11 +294,9 @@ def _change_of_points(problem: Problem, b_from_a: Doubles) -> tuple[Doubles, Dou
 
     # B's change stands inverted before the mapped point: -d pi at the point itself.
     factor = unit_b[:, 0, 0]
-    u, v = np.moveaxis(mapped * factor[:, None, None] + unit_b[:, None, :2, 2], -1, 0)
-    one, zero = np.ones_like(u), np.zeros_like(u)
-    rows_u = np.stack([u, v, one, zero, zero, zero, -u * u, -u * v], axis=-1)
-    rows_v = np.stack([zero, zero, zero, u, v, one, -u * v, -v * v], axis=-1)
-    by_b = -np.stack([rows_u, rows_v], axis=-2) / factor[:, None, None, None]
+    places = mapped * factor[:, None, None] + unit_b[:, None, :2, 2]
+    rows = motion_rows(places.reshape(-1, 2)).reshape(*places.shape, 8)
+    by_b = -rows / factor[:, None, None, None]
     return mapped, by_a, by_b
 
 

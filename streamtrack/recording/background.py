@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 
-import cv2
 import numpy as np
 
 from streamtrack.types import Frame, Image
+from streamtrack.working_size import reduced
 
 _SIDE = 384
 _SAMPLES = 9
@@ -28,7 +28,7 @@ class BackgroundPicture:
             return None
         self._last_s = frame.time_s
         self._gap_s = min(max(_FIRST_GAP_S, 2 * self._gap_s), _MAX_GAP_S)
-        small = _reduced(frame.image)
+        small = reduced(frame.image, min(1.0, _SIDE / max(frame.size_wh)))
         if self._samples and self._samples[0].shape != small.shape:
             return None  # another camera's, for the world stays that of the first
         self._samples.append(small)
@@ -36,9 +36,3 @@ class BackgroundPicture:
         if len(self._samples) % 2 == 0 and len(self._samples) < _SAMPLES:
             return None  # of an even number there is no middle one
         return np.asarray(np.partition(np.stack(self._samples), middle, axis=0)[middle], np.uint8)
-
-
-def _reduced(image: Image) -> Image:
-    factor = min(1.0, _SIDE / max(image.shape[:2]))
-    width, height = (max(1, round(side * factor)) for side in image.shape[1::-1])
-    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)

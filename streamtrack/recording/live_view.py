@@ -33,7 +33,7 @@ from streamtrack.recording.steps import StepLog
 from streamtrack.recording.video import Clock, jpeg_video
 from streamtrack.settings import Settings
 from streamtrack.types import Image, SourceInfo, Step
-from streamtrack.working_size import mapped_features, mapped_track, resized
+from streamtrack.working_size import mapped_features, mapped_track, reduced
 
 _log = logging.getLogger("streamtrack.live")
 
@@ -72,8 +72,7 @@ class LiveView(Closing):
         self.dropped = 0
         self._factor = min(1.0, _MAX_SIDE / max(source.size_wh))
         small = {
-            name: _resized(picture, self._factor)
-            for name, picture in (template_views or {}).items()
+            name: reduced(picture, self._factor) for name, picture in (template_views or {}).items()
         }
         size_wh = round(source.size_wh[0] * self._factor), round(source.size_wh[1] * self._factor)
         world = blueprint.world_shown(settings, has_mosaic)
@@ -245,11 +244,6 @@ class _Channel:
         self._server.write(self._output.read(flush=True) or b"")
 
 
-def _resized(picture: Image, factor: float) -> Image:
-    height, width = picture.shape[:2]
-    return resized(picture, (max(1, round(width * factor)), max(1, round(height * factor))))
-
-
 def _scaled_step(step: Step, factor: float) -> Step:
     """The step as if frames and target pictures had been given smaller."""
     if factor == 1.0:
@@ -258,7 +252,7 @@ def _scaled_step(step: Step, factor: float) -> Step:
     features = step.features
     return replace(
         step,
-        frame=replace(step.frame, image=_resized(step.frame.image, factor), packets=()),
+        frame=replace(step.frame, image=reduced(step.frame.image, factor), packets=()),
         tracks=tuple(
             mapped_track(track, small_from_full, small_from_full) for track in step.tracks
         ),

@@ -27,6 +27,7 @@ from streamtrack.recording import blueprint, rows
 from streamtrack.recording.file import RecordingFiles, free_bytes, new_stream, reserve_bytes
 from streamtrack.recording.video import jpeg_of
 from streamtrack.types import Image, Points, Size, Verdict
+from streamtrack.working_size import reduced
 
 _TIMELINE = "picture"
 MOSAIC_SIDE = 2048
@@ -156,7 +157,7 @@ def _log_picture(stream: rr.RecordingStream, picture: Picture) -> None:
 def _log_link(stream: rr.RecordingStream, link: Link, a: Picture, b: Picture) -> None:
     """Both pictures in one, side by side, and a line for each pair; the agreeing ones on top."""
     factor_a, factor_b = _factor(a.size_wh, _PAIR_SIDE), _factor(b.size_wh, _PAIR_SIDE)
-    small_a, small_b = _resized(_bgr(a.image), factor_a), _resized(_bgr(b.image), factor_b)
+    small_a, small_b = reduced(_bgr(a.image), factor_a), reduced(_bgr(b.image), factor_b)
     left = small_a.shape[1] + _PAIR_GAP
     height = max(small_a.shape[0], small_b.shape[0])
     pair = np.full((height, left + small_b.shape[1], 3), 24, np.uint8)
@@ -255,7 +256,7 @@ def _pages(views: Sequence[Any], a_page: int, name: str) -> list[Any]:
 
 
 def _log_image(stream: rr.RecordingStream, path: str, picture: Image, factor: float) -> None:
-    data = jpeg_of(_resized(picture, factor), _QUALITY)
+    data = jpeg_of(reduced(picture, factor), _QUALITY)
     image = rr.EncodedImage(contents=data, media_type="image/jpeg", draw_order=-10.0)
     stream.log(path, image, static=True)
 
@@ -287,10 +288,3 @@ def _bgr(picture: Image) -> Image:
     if picture.ndim == 3:
         return picture
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR), np.uint8)
-
-
-def _resized(picture: Image, factor: float) -> Image:
-    if factor == 1.0:
-        return picture
-    size = max(1, round(picture.shape[1] * factor)), max(1, round(picture.shape[0] * factor))
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)

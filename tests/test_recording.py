@@ -27,7 +27,7 @@ import streamtrack.recording.video as recorded_video
 import streamtrack.viewer as viewer
 from streamtrack.errors import OutputError, SourceError
 from streamtrack.geometry import box_quad, transform_points, translation
-from streamtrack.recording.blueprint import TargetEntities
+from streamtrack.recording.entities import TargetEntities
 from streamtrack.recording.recorder import Recorder, view
 from streamtrack.settings import Settings, build_settings
 from streamtrack.types import (

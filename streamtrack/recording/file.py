@@ -12,7 +12,7 @@ import rerun.blueprint as rrb
 import rerun_bindings
 
 from streamtrack.errors import OutputError
-from streamtrack.recording.blueprint import APPLICATION_ID
+from streamtrack.recording.entities import APPLICATION_ID
 from streamtrack.recording.series import Hold
 
 _FLUSH_EVERY_S = 0.2

@@ -12,7 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
-from streamtrack.recording import blueprint, rows
+from streamtrack.recording import rows, styles
+from streamtrack.recording.entities import (
+    FOUND_CURVES,
+)
 from streamtrack.targets import color_number
 from streamtrack.types import Step, Track, TrackState
 
@@ -53,7 +56,7 @@ class FoundLog:
         if self._count:
             states = [shown.state for shown in self._alive.values()]
             for state in (TrackState.TRACKING, TrackState.LOST):
-                path = f"{blueprint.FOUND_CURVES}/{state}"
+                path = f"{FOUND_CURVES}/{state}"
                 self._stream.log(path, rows.scalar(states.count(state)))
         return [line for line in lines if line]
 
@@ -84,8 +87,8 @@ class FoundLog:
 
     def _log_style(self, name: str, number: int) -> None:
         style = rr.LineStrips2D.from_fields(
-            colors=[blueprint.target_color(number)],
-            radii=blueprint.ui_points(1.5),
+            colors=[styles.target_color(number)],
+            radii=styles.ui_points(1.5),
             labels=[name],
             show_labels=True,
             draw_order=30,
@@ -93,10 +96,10 @@ class FoundLog:
         self._stream.log(_quad_path(name), style, static=True)
 
     def _log_curve_styles(self) -> None:
-        colors = {TrackState.TRACKING: blueprint.LANE_GREEN, TrackState.LOST: blueprint.LANE_RED}
+        colors = {TrackState.TRACKING: styles.LANE_GREEN, TrackState.LOST: styles.LANE_RED}
         for state, color in colors.items():
-            path = f"{blueprint.FOUND_CURVES}/{state}"
-            blueprint.log_curve_style(self._stream, path, f"automatic targets {state}", color)
+            path = f"{FOUND_CURVES}/{state}"
+            styles.log_curve_style(self._stream, path, f"automatic targets {state}", color)
 
 
 def _quad_path(name: str) -> str:

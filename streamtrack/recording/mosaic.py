@@ -16,9 +16,18 @@ import rerun as rr
 
 from streamtrack.geometry import box_quad, inverted, scaling, transform_points, translation
 from streamtrack.mosaic.types import MosaicView, PlacedFrame
-from streamtrack.recording import blueprint, rows
+from streamtrack.recording import rows, styles
 from streamtrack.recording.background import BackgroundPicture
-from streamtrack.recording.blueprint import TargetEntities
+from streamtrack.recording.entities import (
+    MOSAIC_CURVES,
+    MOSAIC_FRAME,
+    MOSAIC_IMAGE,
+    MOSAIC_KEYFRAMES,
+    MOSAIC_LINKS,
+    MOSAIC_LOOPS,
+    MOSAIC_STATE,
+    TargetEntities,
+)
 from streamtrack.recording.video import jpeg_of
 from streamtrack.targets import color_number
 from streamtrack.types import Frame, Image, Matrix, Points, Size, Step, WorldPlace
@@ -30,10 +39,10 @@ _QUALITIES = (80, 65, 50)
 _MAX_PATH = 1000
 _MOST_TARGETS = 64
 
-_STATE_COLORS: dict[str, blueprint.Rgb] = {
-    "placed": blueprint.LANE_GREEN,
-    "refused": blueprint.LANE_YELLOW,
-    "lost": blueprint.LANE_RED,
+_STATE_COLORS: dict[str, styles.Rgb] = {
+    "placed": styles.LANE_GREEN,
+    "refused": styles.LANE_YELLOW,
+    "lost": styles.LANE_RED,
 }
 
 
@@ -80,9 +89,7 @@ class MosaicLog:
         width, height = frame.size_wh
         small = scaling(picture.shape[1] / width, picture.shape[0] / height)
         self._preview_from_world = square_from_picture @ small
-        self._stream.log(
-            blueprint.MOSAIC_IMAGE, rr.EncodedImage.from_fields(blob=self._jpeg(square))
-        )
+        self._stream.log(MOSAIC_IMAGE, rr.EncodedImage.from_fields(blob=self._jpeg(square)))
 
     def log_world(self, step: Step) -> None:
         """Record the camera's view and the targets' paths where no mosaic is made, in world px."""
@@ -94,7 +101,7 @@ class MosaicLog:
         if pose is not None:
             self._log_outline(_outline(pose, step.frame.size_wh))
         else:
-            self._log_strips(blueprint.MOSAIC_FRAME, np.zeros((0, 5, 2), np.float32))
+            self._log_strips(MOSAIC_FRAME, np.zeros((0, 5, 2), np.float32))
         self._log_targets()
         if self.is_image_due(step.frame.time_s):
             self._last_image_s = step.frame.time_s
@@ -123,10 +130,10 @@ class MosaicLog:
         preview_from_world = square_from_preview @ inverted(view.world_from_preview)
         self._preview_from_world = preview_from_world
         self._outlines = np.asarray(view.keyframe_outlines, np.float32).reshape(-1, 4, 2)
-        self._stream.log(blueprint.MOSAIC_IMAGE, rr.EncodedImage.from_fields(blob=data))
+        self._stream.log(MOSAIC_IMAGE, rr.EncodedImage.from_fields(blob=data))
         outlines = _mapped(preview_from_world, self._outlines)
-        self._log_strips(blueprint.MOSAIC_KEYFRAMES, _closed(outlines))
-        for path, is_loop in ((blueprint.MOSAIC_LINKS, False), (blueprint.MOSAIC_LOOPS, True)):
+        self._log_strips(MOSAIC_KEYFRAMES, _closed(outlines))
+        for path, is_loop in ((MOSAIC_LINKS, False), (MOSAIC_LOOPS, True)):
             self._log_strips(path, _edge_lines(outlines, view, is_loop))
         if view.frame_outline is not None:
             self._log_outline(view.frame_outline)
@@ -151,7 +158,7 @@ class MosaicLog:
         has_changed, self._state = placed.state != self._state, placed.state
         if placed.state != self._shown_state:
             self._shown_state = placed.state
-            self._stream.log(blueprint.MOSAIC_STATE, rr.StateChange(state=placed.state))
+            self._stream.log(MOSAIC_STATE, rr.StateChange(state=placed.state))
         for name, value in placed.metrics.items():
             self._stream.log(self._curve_path(name), rows.scalar(value))
         if placed.world_from_frame is not None:
@@ -159,7 +166,7 @@ class MosaicLog:
             if placed.index == self._frame_index:
                 self._log_targets()
         elif has_changed:
-            self._log_strips(blueprint.MOSAIC_FRAME, np.zeros((0, 5, 2), np.float32))
+            self._log_strips(MOSAIC_FRAME, np.zeros((0, 5, 2), np.float32))
         return has_changed
 
     def _jpeg(self, picture: Image) -> bytes:
@@ -172,7 +179,7 @@ class MosaicLog:
     def _log_styles(self) -> None:
         _log_styles(self._stream)
         for number, (name, path) in enumerate(self._curves.items()):
-            blueprint.log_stage_style(self._stream, path, name, number)
+            styles.log_stage_style(self._stream, path, name, number)
         for name, target in self._targets.items():
             _log_target_styles(self._stream, target.entities, name, target.number)
 
@@ -208,15 +215,15 @@ class MosaicLog:
     def _log_outline(self, outline: Points) -> None:
         if self._preview_from_world is not None:
             quads = _mapped(self._preview_from_world, np.asarray(outline, np.float32)[None])
-            self._log_strips(blueprint.MOSAIC_FRAME, _closed(quads))
+            self._log_strips(MOSAIC_FRAME, _closed(quads))
 
     def _log_strips(self, path: str, strips: npt.NDArray[np.float32]) -> None:
         self._stream.log(path, rows.strips(strips))
 
     def _curve_path(self, name: str) -> str:
         if name not in self._curves:
-            path = rr.new_entity_path([*blueprint.MOSAIC_CURVES.split("/"), name])
-            blueprint.log_stage_style(self._stream, path, name, len(self._curves))
+            path = rr.new_entity_path([*MOSAIC_CURVES.split("/"), name])
+            styles.log_stage_style(self._stream, path, name, len(self._curves))
             self._curves[name] = path
         return self._curves[name]
 
@@ -286,38 +293,38 @@ def _framed(picture: Image) -> tuple[Image, Matrix]:
 def _log_styles(stream: rr.RecordingStream) -> None:
     """Log once how a growing mosaic is drawn."""
     stream.log(
-        blueprint.MOSAIC_IMAGE,
+        MOSAIC_IMAGE,
         rr.EncodedImage.from_fields(media_type="image/jpeg", draw_order=-10.0),
         static=True,
     )
     for path, color, radius, order in (
-        (blueprint.MOSAIC_KEYFRAMES, (120, 130, 150), 0.5, 10),
-        (blueprint.MOSAIC_LINKS, blueprint.BLUE, 0.8, 20),
-        (blueprint.MOSAIC_LOOPS, blueprint.ORANGE, 1.6, 21),
-        (blueprint.MOSAIC_FRAME, (255, 255, 255), 2.0, 30),
+        (MOSAIC_KEYFRAMES, (120, 130, 150), 0.5, 10),
+        (MOSAIC_LINKS, styles.BLUE, 0.8, 20),
+        (MOSAIC_LOOPS, styles.ORANGE, 1.6, 21),
+        (MOSAIC_FRAME, (255, 255, 255), 2.0, 30),
     ):
         stream.log(
             path,
             rr.LineStrips2D.from_fields(
                 colors=[color],
-                radii=blueprint.ui_points(radius),
+                radii=styles.ui_points(radius),
                 show_labels=False,
                 draw_order=order,
             ),
             static=True,
         )
-    blueprint.log_lane_style(stream, blueprint.MOSAIC_STATE, _STATE_COLORS)
+    styles.log_lane_style(stream, MOSAIC_STATE, _STATE_COLORS)
 
 
 def _log_target_styles(
     stream: rr.RecordingStream, entities: TargetEntities, name: str, number: int
 ) -> None:
     """Log once how a target is drawn on the mosaic."""
-    color = blueprint.target_color(number)
+    color = styles.target_color(number)
     stream.log(
         entities.mosaic_path,
         rr.LineStrips2D.from_fields(
-            colors=[color], radii=blueprint.ui_points(1.5), show_labels=False, draw_order=40
+            colors=[color], radii=styles.ui_points(1.5), show_labels=False, draw_order=40
         ),
         static=True,
     )
@@ -325,7 +332,7 @@ def _log_target_styles(
         entities.mosaic_position,
         rr.Points2D.from_fields(
             colors=[color],
-            radii=blueprint.ui_points(5.0),
+            radii=styles.ui_points(5.0),
             labels=[name],
             show_labels=True,
             draw_order=41,

@@ -23,7 +23,15 @@ import rerun.blueprint as rrb
 from streamtrack.errors import OutputError
 from streamtrack.geometry import scaling, transform_points
 from streamtrack.mosaic.types import Link, Picture, Placement, Status
-from streamtrack.recording import blueprint, rows
+from streamtrack.recording import blueprint, rows, styles
+from streamtrack.recording.entities import (
+    INLIER,
+    LOG,
+    MOSAIC_IMAGE,
+    OUTLIER,
+    SUMMARY,
+    UNMATCHED,
+)
 from streamtrack.recording.file import RecordingFiles, free_bytes, new_stream, reserve_bytes
 from streamtrack.recording.video import jpeg_of
 from streamtrack.types import Image, Points, Size, Verdict
@@ -80,7 +88,7 @@ def record_picture_mosaic(
             _log_link(stream, link, by_index[link.a], by_index[link.b])
         _log_lines(stream, placements, links, len(links) - len(shown))
         document = rr.TextDocument(summary_markdown, media_type="text/markdown")
-        stream.log(blueprint.SUMMARY, document, static=True)
+        stream.log(SUMMARY, document, static=True)
     finally:
         is_whole = files.close()
     if not is_whole:
@@ -113,9 +121,9 @@ def _no_room(path: Path) -> OutputError:
 
 
 def _log_styles(stream: rr.RecordingStream) -> None:
-    blueprint.log_styles(stream)
+    styles.log_styles(stream)
     for root in ("links", "pictures"):
-        stream.log(root, blueprint.point_classes(), static=True)
+        stream.log(root, styles.point_classes(), static=True)
 
 
 def _log_mosaic(
@@ -125,16 +133,16 @@ def _log_mosaic(
     placements: Sequence[Placement],
 ) -> None:
     factor = _factor((mosaic.shape[1], mosaic.shape[0]), MOSAIC_SIDE)
-    _log_image(stream, blueprint.MOSAIC_IMAGE, mosaic, factor)
+    _log_image(stream, MOSAIC_IMAGE, mosaic, factor)
     shown = [placement for placement in placements if placement.index in outlines]
     stream.log(
         "mosaic/outlines",
         rr.LineStrips2D(
             [transform_points(scaling(factor), outlines[one.index]) for one in shown],
-            colors=[blueprint.target_color(number) for number in range(len(shown))],
+            colors=[styles.target_color(number) for number in range(len(shown))],
             labels=[one.name for one in shown],
             show_labels=len(shown) <= _PICTURES_A_PAGE,
-            radii=blueprint.ui_points(1.0),
+            radii=styles.ui_points(1.0),
             draw_order=10.0,
         ),
         static=True,
@@ -146,11 +154,9 @@ def _log_picture(stream: rr.RecordingStream, picture: Picture) -> None:
     _log_image(stream, f"pictures/{picture.index}/image", picture.image, factor)
     path = f"pictures/{picture.index}/keypoints"
     points = transform_points(scaling(factor), picture.features.points)
-    classes = np.full(len(points), blueprint.UNMATCHED, np.uint16)
+    classes = np.full(len(points), UNMATCHED, np.uint16)
     stream.log(path, rows.points(points, classes), static=True)
-    style = rr.Points2D.from_fields(
-        radii=blueprint.ui_points(1.5), show_labels=False, draw_order=20
-    )
+    style = rr.Points2D.from_fields(radii=styles.ui_points(1.5), show_labels=False, draw_order=20)
     stream.log(path, style, static=True)
 
 
@@ -174,10 +180,10 @@ def _log_link(stream: rr.RecordingStream, link: Link, a: Picture, b: Picture) ->
     )
     lines: npt.NDArray[np.float32] = np.stack([start, end], axis=1).astype(np.float32)
     is_inlier = link.registration.is_inlier[order]
-    classes = np.where(is_inlier, blueprint.INLIER, blueprint.OUTLIER).astype(np.uint16)
+    classes = np.where(is_inlier, INLIER, OUTLIER).astype(np.uint16)
     stream.log(f"{path}/matches", rows.strips(lines, classes), static=True)
     style = rr.LineStrips2D.from_fields(
-        radii=blueprint.ui_points(0.5), show_labels=False, draw_order=10
+        radii=styles.ui_points(0.5), show_labels=False, draw_order=10
     )
     stream.log(f"{path}/matches", style, static=True)
 
@@ -194,13 +200,13 @@ def _log_lines(
         is_used = placement.status is Status.USED
         text = f"{placement.name}: {placement.status}"
         text += f": {placement.reason}" if placement.reason else f", {placement.features} features"
-        stream.log(blueprint.LOG, rr.TextLog(text, level="INFO" if is_used else "WARN"))
+        stream.log(LOG, rr.TextLog(text, level="INFO" if is_used else "WARN"))
     for link in links:
         stream.set_time(_TIMELINE, sequence=max(link.a, link.b))
-        stream.log(blueprint.LOG, rr.TextLog(_link_text(link), level="INFO"))
+        stream.log(LOG, rr.TextLog(_link_text(link), level="INFO"))
     if hidden:
         text = f"{hidden} of {len(links)} links are not shown as pictures"
-        stream.log(blueprint.LOG, rr.TextLog(text, level="INFO"))
+        stream.log(LOG, rr.TextLog(text, level="INFO"))
 
 
 def _layout(

@@ -18,7 +18,21 @@ import rerun as rr
 
 from streamtrack.errors import OutputError
 from streamtrack.mosaic.types import PlacedFrame
-from streamtrack.recording import blueprint, rows
+from streamtrack.recording import blueprint, rows, styles
+from streamtrack.recording.entities import (
+    AGE_MS,
+    FEATURE_COUNT,
+    INLIER,
+    KEYPOINTS,
+    LOG,
+    MATCHES,
+    OUTLIER,
+    SOURCE_COUNTS,
+    SOURCE_STATE,
+    SUMMARY,
+    TOTAL_MS,
+    UNMATCHED,
+)
 from streamtrack.recording.found import FoundLog
 from streamtrack.recording.mosaic import MosaicLog
 from streamtrack.recording.target import TargetLog
@@ -84,14 +98,14 @@ class StepLog:
     def begin(self) -> None:
         """Record what each part needs at its start."""
         self._log_properties()
-        blueprint.log_styles(self._stream)
+        styles.log_styles(self._stream)
         if self._source.is_live:
-            blueprint.log_source_styles(self._stream)
+            styles.log_source_styles(self._stream)
         self.log_summary(self.summary)
         for target in self._targets.values():
             target.begin(self._target_count)
         for number, (stage, path) in enumerate(self._stages.items()):
-            blueprint.log_stage_style(self._stream, path, stage, number)
+            styles.log_stage_style(self._stream, path, stage, number)
         self.video.begin()
         self._found.begin()
         self._mosaic.begin()
@@ -144,7 +158,7 @@ class StepLog:
         self.log_line(level, message)
 
     def log_line(self, level: str, message: str) -> None:
-        self._stream.log(blueprint.LOG, rr.TextLog(message, level=level))
+        self._stream.log(LOG, rr.TextLog(message, level=level))
 
     def log_source(self, state: str, counts: Mapping[str, int], time_s: float | None) -> None:
         """The state of a live source, and its counts (frames dropped, lost ...) so far."""
@@ -157,9 +171,9 @@ class StepLog:
                 for target in self._targets.values():
                     target.pause()
         for number, (name, count) in enumerate(counts.items()):
-            path = rr.new_entity_path([*blueprint.SOURCE_COUNTS.split("/"), name])
+            path = rr.new_entity_path([*SOURCE_COUNTS.split("/"), name])
             if name not in self._counts:
-                blueprint.log_stage_style(self._stream, path, name, number)
+                styles.log_stage_style(self._stream, path, name, number)
             if self._counts.get(name) != count:
                 self._counts[name] = count
                 self._stream.log(path, rows.scalar(count))
@@ -182,7 +196,7 @@ class StepLog:
 
     def log_summary(self, markdown: str) -> None:
         document = rr.TextDocument(markdown, media_type="text/markdown")
-        self._stream.log(blueprint.SUMMARY, document, static=True)
+        self._stream.log(SUMMARY, document, static=True)
 
     def close(self, summary_markdown: str = "") -> None:
         """Record what was held back, and the summary."""
@@ -214,7 +228,7 @@ class StepLog:
         )
 
     def _log_source_state(self) -> None:
-        self._stream.log(blueprint.SOURCE_STATE, rr.StateChange(state=self._source_state))
+        self._stream.log(SOURCE_STATE, rr.StateChange(state=self._source_state))
 
     def _target(self, name: str) -> TargetLog:
         """The target's part of the recording, begun when it is first asked for."""
@@ -247,12 +261,12 @@ class StepLog:
         if not self._has_points and not len(points):
             return
         self._has_points = len(points) > 0
-        classes = np.full(len(points), blueprint.UNMATCHED, np.uint16)
+        classes = np.full(len(points), UNMATCHED, np.uint16)
         agreeing = [_classes(one.is_inlier) for one in evidence]
         if agreeing:
             paired = np.concatenate(agreeing)
             classes[len(points) - len(paired) :] = paired
-        self._stream.log(blueprint.KEYPOINTS, rows.points(points, classes))
+        self._stream.log(KEYPOINTS, rows.points(points, classes))
         self._log_lines(step.tracks)
 
     def _log_lines(self, tracks: Sequence[Track]) -> None:
@@ -266,17 +280,15 @@ class StepLog:
             if start is not None:
                 lines.append(np.stack([start, track.evidence.frame_points], axis=1))
                 classes.append(_classes(track.evidence.is_inlier))
-        self._stream.log(
-            blueprint.MATCHES, rows.strips(np.concatenate(lines), np.concatenate(classes))
-        )
+        self._stream.log(MATCHES, rows.strips(np.concatenate(lines), np.concatenate(classes)))
 
     def _log_times(self, step: Step) -> None:
         if step.features is not None:
-            self._stream.log(blueprint.FEATURE_COUNT, rows.scalar(len(step.features)))
+            self._stream.log(FEATURE_COUNT, rows.scalar(len(step.features)))
         captured = step.frame.captured_unix_s
         if captured is not None:
             age_ms = 1e3 * (time.time() - captured)
-            self._stream.log(blueprint.AGE_MS, rows.scalar(age_ms))
+            self._stream.log(AGE_MS, rows.scalar(age_ms))
         for stage, milliseconds in step.stage_ms.items():
             self._stream.log(self._stage_path(stage), rows.scalar(milliseconds))
         for stage in self._last_stages - step.stage_ms.keys():
@@ -285,10 +297,10 @@ class StepLog:
 
     def _stage_path(self, stage: str) -> str:
         if stage == "total":
-            return blueprint.TOTAL_MS
+            return TOTAL_MS
         if stage not in self._stages:
-            path = rr.new_entity_path([*blueprint.TOTAL_MS.split("/"), stage])
-            blueprint.log_stage_style(self._stream, path, stage, len(self._stages))
+            path = rr.new_entity_path([*TOTAL_MS.split("/"), stage])
+            styles.log_stage_style(self._stream, path, stage, len(self._stages))
             self._stages[stage] = path
         return self._stages[stage]
 
@@ -318,7 +330,7 @@ def _version() -> str:
 
 
 def _classes(is_inlier: Mask) -> npt.NDArray[np.uint16]:
-    return np.where(is_inlier, blueprint.INLIER, blueprint.OUTLIER).astype(np.uint16)
+    return np.where(is_inlier, INLIER, OUTLIER).astype(np.uint16)
 
 
 def _level_of(state: TrackState) -> str:

@@ -9,8 +9,11 @@ import numpy as np
 import rerun as rr
 
 from streamtrack.geometry import bounding_box, inverted, scaling, transform_points, translation
-from streamtrack.recording import blueprint, rows
-from streamtrack.recording.blueprint import TargetEntities
+from streamtrack.recording import rows, styles
+from streamtrack.recording.entities import (
+    NO_PICTURE,
+    TargetEntities,
+)
 from streamtrack.recording.video import jpeg_of
 from streamtrack.types import Image, Matrix, Points, Size, Step, Track, TrackState
 
@@ -44,7 +47,7 @@ class TargetLog:
 
     def begin(self, count: int) -> None:
         """Record what each part needs at its start, for one of ``count`` targets."""
-        blueprint.log_target_styles(self._stream, self._entities, self._name, self._number, count)
+        styles.log_target_styles(self._stream, self._entities, self._name, self._number, count)
         if self._template is not None:
             self._log_template(self._template)
         self._is_state_due = True
@@ -80,7 +83,7 @@ class TargetLog:
 
     def pause(self) -> None:
         """No more pictures come for now: the state was that of the last one."""
-        self._stream.log(self._entities.state, rr.StateChange(state=blueprint.NO_PICTURE))
+        self._stream.log(self._entities.state, rr.StateChange(state=NO_PICTURE))
         self._is_state_due = True
 
     def _log_quad(self, quad: Points) -> None:

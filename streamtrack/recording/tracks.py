@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import rerun as rr
 
-from streamtrack.recording import blueprint
+from streamtrack.recording.entities import TRACKS
 from streamtrack.types import Step, Track, TrackState
 
 _EVERY_S = 0.5
@@ -38,7 +38,7 @@ class TracksTable:
         if step.tracks and not 0.0 <= time_s - self._last_s < _EVERY_S:
             self._last_s = time_s
             self._stream.log(
-                blueprint.TRACKS,
+                TRACKS,
                 rr.TextDocument(self.markdown(step.tracks), media_type="text/markdown"),
             )
         if len(self._seen) > 16 * _MOST_ROWS:  # automatic targets come and go for ever

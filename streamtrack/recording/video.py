@@ -14,7 +14,7 @@ import numpy as np
 import rerun as rr
 
 from streamtrack.errors import OutputError
-from streamtrack.recording.blueprint import IMAGE
+from streamtrack.recording.entities import IMAGE
 from streamtrack.settings import RecordingSettings, VideoMode
 from streamtrack.sources.encoder import Av1Encoder
 from streamtrack.types import Frame, Image, Packet, Size, SourceInfo

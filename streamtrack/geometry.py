@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from math import inf, isfinite, sqrt
+from math import copysign, hypot, inf, isfinite, sqrt
 from typing import Any
 
 import numpy as np
@@ -121,25 +121,29 @@ def image_quad(size_wh: Size) -> Points:
 
 
 def _corner_list(quad: npt.ArrayLike) -> list[Any]:
+    # In plain numbers: for the few corners of a polygon numpy would be ten times as slow.
     if isinstance(quad, list):
         return quad
-    return list(np.asarray(quad, np.float64).reshape(-1, 2).tolist())
+    return list(np.asarray(quad).reshape(-1, 2).tolist())
 
 
 def grown_quad(quad: npt.ArrayLike, margin: float) -> Points:
     """The quad (4, 2) with each side moved outwards by ``margin``; as it is if it is not convex."""
-    corners = np.asarray(quad, np.float64).reshape(4, 2)
+    corners = _corner_list(quad)
     area = signed_area(corners)
     if not is_convex(corners) or not isfinite(area):
-        return corners.astype(np.float32)
-    along = np.roll(corners, -1, axis=0) - corners
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    outward = np.stack([along[:, 1], -along[:, 0]], axis=1) * (1.0 if area > 0 else -1.0)
-    before = np.roll(outward, 1, axis=0)
-    # At a corner both sides move: along the bisector, farther the sharper it is, within reason.
-    together = 1.0 + np.sum(outward * before, axis=1, keepdims=True)
-    moved = corners + margin * (outward + before) / np.maximum(together, 0.25)
-    return np.asarray(moved, np.float32)
+        return np.asarray(corners, np.float32)
+    outward = []
+    for (x, y), (next_x, next_y) in zip(corners, corners[1:] + corners[:1], strict=True):
+        along_x, along_y = next_x - x, next_y - y
+        length = copysign(hypot(along_x, along_y), area)
+        outward.append((along_y / length, -along_x / length))
+    moved = []
+    for (x, y), (ax, ay), (bx, by) in zip(corners, outward[-1:] + outward, outward, strict=False):
+        # At a corner both sides move: along the bisector, farther the sharper it is, within reason.
+        reach = margin / max(1.0 + ax * bx + ay * by, 0.25)
+        moved.append((x + reach * (ax + bx), y + reach * (ay + by)))
+    return np.array(moved, np.float32)
 
 
 def signed_area(quad: npt.ArrayLike) -> float:
@@ -165,7 +169,10 @@ def is_convex(quad: npt.ArrayLike) -> bool:
 
 def bounding_box(points: npt.ArrayLike) -> tuple[float, float, float, float]:
     """(x0, y0, x1, y1) of points (N, 2)."""
-    pts = np.asarray(points, np.float64).reshape(-1, 2)
+    pts = np.asarray(points).reshape(-1, 2)
+    if len(pts) <= _FEW and np.isfinite(pts).all():
+        x, y = pts.T.tolist()
+        return min(x), min(y), max(x), max(y)
     x0, y0 = pts.min(axis=0)
     x1, y1 = pts.max(axis=0)
     return float(x0), float(y0), float(x1), float(y1)
@@ -176,31 +183,30 @@ def clipped_quad_area(quad: npt.ArrayLike, size_wh: Size) -> float:
 
     Sutherland-Hodgman clipping against the picture's outer pixel edges.
     """
-    polygon = np.asarray(quad, np.float64).reshape(-1, 2)
+    polygon = _corner_list(quad)
     for axis, bound, sign in (
         (0, -0.5, 1.0),
         (0, size_wh[0] - 0.5, -1.0),
         (1, -0.5, 1.0),
         (1, size_wh[1] - 0.5, -1.0),
     ):
-        polygon = _clip_half_plane(polygon, sign * (polygon[:, axis] - bound))
+        polygon = _clip_half_plane(polygon, [sign * (corner[axis] - bound) for corner in polygon])
         if len(polygon) < 3:
             return 0.0
     return abs(signed_area(polygon))
 
 
-def _clip_half_plane(
-    polygon: npt.NDArray[np.float64], inside: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
-    kept: list[npt.NDArray[np.float64]] = []
-    for i in range(len(polygon)):
-        j = (i + 1) % len(polygon)
-        if inside[i] >= 0:
-            kept.append(polygon[i])
-        if (inside[i] >= 0) != (inside[j] >= 0):
-            t = inside[i] / (inside[i] - inside[j])
-            kept.append(polygon[i] + t * (polygon[j] - polygon[i]))
-    return np.array(kept).reshape(-1, 2)
+def _clip_half_plane(polygon: list[Any], inside: list[float]) -> list[Any]:
+    """The part of a polygon where ``inside``, linear and given at its corners, is not negative."""
+    kept = []
+    corners = zip(polygon, polygon[1:] + polygon[:1], inside, inside[1:] + inside[:1], strict=True)
+    for (x, y), (next_x, next_y), here, there in corners:
+        if here >= 0:
+            kept.append((x, y))
+        if (here >= 0) != (there >= 0):
+            t = here / (here - there)
+            kept.append((x + t * (next_x - x), y + t * (next_y - y)))
+    return kept
 
 
 def visible_share(quad: npt.ArrayLike, size_wh: Size) -> float:

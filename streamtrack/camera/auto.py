@@ -33,6 +33,7 @@ one 0.25."""
 _STILL_FRAMES = 25
 _MOST_STILL_FRAMES = 400
 _OTHER_FRAMES = 5  # in a row: something large may pass by
+_MOST_PAUSE = 10  # frames between two looks whether a camera that moves has come to rest
 _RENEW_EVERY = 250  # frames, so that the light may change
 
 
@@ -71,6 +72,8 @@ class AutoCamera:
         self._standing: _Standing | None = None
         self._rest: _Rest | None = None
         self._needed = _STILL_FRAMES
+        self._pause = 0
+        self._frames_to_look = 0
 
     @property
     def graph(self) -> KeyframeGraph:
@@ -98,22 +101,35 @@ class AutoCamera:
     def _look_for_rest(
         self, pose: Matrix, keyframe: int, view: FrameView, tracks: Sequence[Track]
     ) -> None:
-        """Has the picture been the same for long enough? From here on the camera stands then."""
+        """Has the picture been the same for long enough? From here on the camera stands then.
+
+        While every look finds another picture the camera moves, and is looked at ever more seldom.
+        """
         levels, hidden, rest = view.levels, _hidden(tracks), self._rest
-        if rest is not None and _is_at_rest(
-            rest.check.of(levels, hidden), rest.check, levels, _BEGINS
-        ):
+        if rest is None:
+            self._frames_to_look -= 1
+            if self._frames_to_look < 0:
+                self._rest = self._begun_rest(view, hidden)
+        elif _is_at_rest(rest.check.of(levels, hidden), rest.check, levels, _BEGINS):
             rest.add(pose, view.size_wh)
+            self._pause = 0
             if rest.frames >= self._needed:
                 found = rest.pose(view.size_wh)
                 world_from_keyframe = self.graph.keyframes[keyframe].world_from_keyframe
                 in_keyframe = geometry.normalized(geometry.inverted(world_from_keyframe) @ found)
                 self._standing = _Standing(keyframe, in_keyframe, rest.check)
                 self._rest = None
-        elif rest is None or rest.is_over():
-            check = StandCheck(levels, hidden)
-            is_start = view.frame.index == next(iter(self.graph.keyframes))
-            self._rest = _Rest(check, is_start) if check.is_possible else None
+        elif rest.is_over():
+            if rest.frames == 0:
+                self._pause = min(2 * self._pause + 1, _MOST_PAUSE)
+            self._frames_to_look = self._pause
+            self._rest = None if self._pause else self._begun_rest(view, hidden)
+
+    def _begun_rest(self, view: FrameView, hidden: Sequence[Points]) -> _Rest | None:
+        """A rest that may begin in this frame; None where the picture does not tell."""
+        check = StandCheck(view.levels, hidden)
+        is_start = view.frame.index == next(iter(self.graph.keyframes))
+        return _Rest(check, is_start) if check.is_possible else None
 
     def _glance(self, standing: _Standing, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
         """The pose of a camera that stood until now."""
@@ -160,9 +176,12 @@ class _Rest:
         self._corners = np.zeros((4, 2))
 
     def is_over(self) -> bool:
-        """Whether the picture, now another, has been for long enough to compare with a new one."""
+        """Whether the picture, now another, has been for long enough to compare with a new one.
+
+        At once if it never was the same.
+        """
         self._others += 1
-        return self._others >= _OTHER_FRAMES
+        return self.frames == 0 or self._others >= _OTHER_FRAMES
 
     def add(self, world_from_frame: Matrix, size_wh: Size) -> None:
         corners = geometry.transform_points(world_from_frame, geometry.image_quad(size_wh))

@@ -20,6 +20,7 @@ from streamtrack.camera.keyframe_links import LevelCache, NewKeyframe, link_of, 
 from streamtrack.camera.keyframes import KeyframeGraph
 from streamtrack.camera.layers import Doubts, separated
 from streamtrack.camera.loops import LoopCloser
+from streamtrack.camera.placed import Placed, Sight
 from streamtrack.camera.relocalising import Relocaliser
 from streamtrack.camera.shear import ShearWatch
 from streamtrack.camera.view_alignment import align, align_exactly, align_near
@@ -110,133 +111,116 @@ class MovingCamera:
     def update(self, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
         """The camera's pose in the next frame; targets' quads are left out of account."""
         self._loops.advance()
-        levels = view.levels
-        hidden = _outlines(tracks, levels)
+        sight = Sight(view, _outlines(tracks, view.levels))
         state = self._state
         if state is None:
-            return self._begin(view, levels, hidden)
-        if levels.is_flat():
+            return self._begin(sight)
+        if view.levels.is_flat():
             return CameraPose(None, reason=str(Verdict.TOO_FEW_FEATURES))
-        found = self._follow(state, view, levels, hidden)
-        keyframe = state.keyframe
-        if found.reference_from_view is None:
-            recognised = self._recognise(state, levels, hidden)
+        placed = Placed(state.keyframe, self._follow(state, sight))
+        if placed.keyframe_from_frame is None:
+            recognised = self._recognise(state, sight)
             if recognised is None:
-                return _refused(found)
-            keyframe, found = recognised
-        found = self._background(keyframe, levels, hidden, found)
-        if found.reference_from_view is None:
-            return _refused(found)
+                return placed.refusal()
+            placed = recognised
+        placed = self._background(placed, sight)
+        if placed.keyframe_from_frame is None:
+            return placed.refusal()
         self._relocaliser.rest()
-        return self._placed(view, levels, hidden, keyframe, found)
+        return self._accepted(placed, sight)
 
     def close(self) -> None:
         """Finish the work on loops: the graph's poses are final then."""
         self._loops.close()
 
-    def _begin(self, view: FrameView, levels: ViewLevels, hidden: Sequence[Points]) -> CameraPose:
-        reference = ReferenceView(levels, hidden)
+    def _begin(self, sight: Sight) -> CameraPose:
+        reference = ReferenceView(sight.levels, sight.hidden)
         cells = reference.textured_cells
         if cells < _MIN_TEXTURED_CELLS:
             return CameraPose(None, reason=str(Verdict.TOO_FEW_FEATURES))
-        self._take(view, reference, np.eye(3), None)
-        self._shear.begin(view.frame.index)
-        self._state = _State(view.frame.index, np.eye(3), levels, view.frame.time_s, None, 0.0)
-        return CameraPose(np.eye(3), cells, cells, 0.0, keyframe=view.frame.index, is_keyframe=True)
+        index = sight.index
+        self._take(sight.view, reference, np.eye(3), None)
+        self._shear.begin(index)
+        self._state = _State(index, np.eye(3), sight.levels, sight.time_s, None, 0.0)
+        return CameraPose(np.eye(3), cells, cells, 0.0, keyframe=index, is_keyframe=True)
 
-    def _follow(
-        self, state: _State, view: FrameView, levels: ViewLevels, hidden: Sequence[Points]
-    ) -> ViewAlignment:
+    def _follow(self, state: _State, sight: Sight) -> ViewAlignment:
         """The frame against the keyframe of the frame before, where the motion leads or leaves."""
         reference = self._reference(state.keyframe)
-        guess = state.predicted(view.frame.time_s)
+        levels, hidden, size_wh = sight.levels, sight.hidden, sight.size_wh
+        guess = state.predicted(sight.time_s)
         if state.step is not None:
-            found = _without_jump(align_near(reference, levels, guess, hidden), guess, view.size_wh)
+            found = _without_jump(align_near(reference, levels, guess, hidden), guess, size_wh)
             if found.reference_from_view is not None:
                 return found
-        found = _without_jump(align(reference, levels, guess, hidden), guess, view.size_wh)
+        found = _without_jump(align(reference, levels, guess, hidden), guess, size_wh)
         if found.reference_from_view is not None:
             return found
         guess = state.keyframe_from_frame
         searched = align(reference, levels, guess, hidden, is_searched=True)
-        searched = _without_jump(searched, guess, view.size_wh)
+        searched = _without_jump(searched, guess, size_wh)
         return found if searched.reference_from_view is None else searched
 
-    def _recognise(
-        self, state: _State, levels: ViewLevels, hidden: Sequence[Points]
-    ) -> tuple[int, ViewAlignment] | None:
+    def _recognise(self, state: _State, sight: Sight) -> Placed | None:
         """The keyframe that a frame shows by its features, and the alignment that confirms it."""
-        for keyframe, guess in self._relocaliser.candidates(state.keyframe, levels):
-            found = align(self._reference(keyframe), levels, guess, hidden)
+        for keyframe, guess in self._relocaliser.candidates(state.keyframe, sight.levels):
+            found = align(self._reference(keyframe), sight.levels, guess, sight.hidden)
             if found.reference_from_view is not None:
-                return keyframe, found
+                return Placed(keyframe, found)
         return None
 
-    def _background(
-        self, keyframe: int, levels: ViewLevels, hidden: Sequence[Points], found: ViewAlignment
-    ) -> ViewAlignment:
+    def _background(self, placed: Placed, sight: Sight) -> Placed:
         """The alignment of what lies behind, where the one found has doubtful support.
 
         What moves before it is left out of the keyframe from then on.
         """
+        keyframe, found = placed.keyframe, placed.found
         if not self._doubts.are_due(keyframe, found):
-            return found
+            return placed
         reference = self._reference(keyframe)
-        layers = separated(reference, levels, found, hidden)
+        layers = separated(reference, sight.levels, found, sight.hidden)
         if layers.foreground:
             outlines = (*reference.hidden, *layers.foreground)
             self.graph.hide(keyframe, outlines)
             self._keep_reference(keyframe, ReferenceView(reference.levels, outlines))
-        return layers.background
+        return Placed(keyframe, layers.background)
 
-    def _placed(
-        self,
-        view: FrameView,
-        levels: ViewLevels,
-        hidden: Sequence[Points],
-        keyframe: int,
-        found: ViewAlignment,
-    ) -> CameraPose:
-        """The pose of an accepted frame; goes over to another keyframe where that is better."""
-        keyframe_from_frame = found.reference_from_view
-        assert keyframe_from_frame is not None
-        index, matches = view.frame.index, len(found.is_inlier)
-        world_from_keyframe = self.graph.keyframes[keyframe].world_from_keyframe
-        world_from_frame = geometry.normalized(world_from_keyframe @ keyframe_from_frame)
-        if self._shear.is_sheared(keyframe, found, view.size_wh):
-            return CameraPose(None, matches, found.inliers, found.rmse_px, str(Verdict.SHEARED))
+    def _accepted(self, placed: Placed, sight: Sight) -> CameraPose:
+        """The pose of a frame in a keyframe; goes over to another one where that is better."""
+        keyframe, found, keyframe_from_frame = placed.keyframe, placed.found, placed.pose
+        if self._shear.is_sheared(keyframe, found, sight.size_wh):
+            return placed.camera_pose(None, Verdict.SHEARED)
+        world_from_frame = self._in_world(keyframe, keyframe_from_frame)
         before = self._state
-        self._remember(view, keyframe, keyframe_from_frame)
-        if _stretch(world_from_frame, view.size_wh) > _MAX_STRETCH:
-            return CameraPose(None, matches, found.inliers, found.rmse_px, str(Verdict.STRETCHED))
-        self.graph.add_frame(index, keyframe, keyframe_from_frame)
+        self._remember(placed, sight)
+        if _stretch(world_from_frame, sight.size_wh) > _MAX_STRETCH:
+            return placed.camera_pose(None, Verdict.STRETCHED)
+        self.graph.add_frame(sight.index, keyframe, keyframe_from_frame)
         is_keyframe = False
-        if self._has_moved_on(found, view, keyframe):
-            other = self._better_keyframe(view, levels, hidden, keyframe, world_from_frame)
+        if self._has_moved_on(placed, sight):
+            other = self._better_keyframe(placed, sight, world_from_frame)
             if other is not None:
                 keyframe = other
-            elif self._extend(view, before, hidden, keyframe, found):
-                keyframe, is_keyframe = index, True
-            moved = self.graph.world_from_frame(index)
+            elif self._extend(placed, sight, before):
+                keyframe, is_keyframe = sight.index, True
+            moved = self.graph.world_from_frame(sight.index)
             world_from_frame = world_from_frame if moved is None else moved
-        return CameraPose(
-            world_from_frame,
-            matches,
-            found.inliers,
-            found.rmse_px,
-            keyframe=keyframe,
-            is_keyframe=is_keyframe,
-        )
+        pose = placed.camera_pose(world_from_frame)
+        return replace(pose, keyframe=keyframe, is_keyframe=is_keyframe)
 
-    def _remember(self, view: FrameView, keyframe: int, keyframe_from_frame: Matrix) -> None:
-        state, time_s = self._state, view.frame.time_s
+    def _in_world(self, keyframe: int, keyframe_from_frame: Matrix) -> Matrix:
+        world_from_keyframe = self.graph.keyframes[keyframe].world_from_keyframe
+        return geometry.normalized(world_from_keyframe @ keyframe_from_frame)
+
+    def _remember(self, placed: Placed, sight: Sight) -> None:
+        state, time_s = self._state, sight.time_s
         step, step_s = None, 0.0
-        if state is not None and state.keyframe == keyframe and time_s > state.time_s:
-            motion = geometry.inverted(state.keyframe_from_frame) @ keyframe_from_frame
-            quad = geometry.image_quad(view.size_wh)
+        if state is not None and state.keyframe == placed.keyframe and time_s > state.time_s:
+            motion = geometry.inverted(state.keyframe_from_frame) @ placed.pose
+            quad = geometry.image_quad(sight.size_wh)
             step = fit(Model.SIMILARITY, quad, geometry.transform_points(motion, quad))
             step_s = time_s - state.time_s
-        self._state = _State(keyframe, keyframe_from_frame, view.levels, time_s, step, step_s)
+        self._state = _State(placed.keyframe, placed.pose, sight.levels, time_s, step, step_s)
 
     def _go_over(self, keyframe: int, keyframe_from_frame: Matrix) -> None:
         """Go on from another keyframe; the motion from frame to frame stays."""
@@ -244,94 +228,71 @@ class MovingCamera:
         assert state is not None
         self._state = replace(state, keyframe=keyframe, keyframe_from_frame=keyframe_from_frame)
 
-    def _has_moved_on(self, found: ViewAlignment, view: FrameView, keyframe: int) -> bool:
-        if _overlap(found, view.size_wh) < _MIN_OVERLAP or found.inliers < _MIN_AGREEING_CELLS:
+    def _has_moved_on(self, placed: Placed, sight: Sight) -> bool:
+        found = placed.found
+        if found.inliers < _MIN_AGREEING_CELLS or placed.overlap(sight) < _MIN_OVERLAP:
             return True
         has_changed = found.inliers < _MIN_LASTING_SHARE * len(found.is_inlier)
         has_changed |= found.corner_sigma_px > _MAX_LASTING_SIGMA_PX
-        return has_changed and view.frame.index >= keyframe + _MIN_SPACING
-
-    def _may_be_keyframe(self, found: ViewAlignment, size_wh: Size) -> bool:
-        is_late = _overlap(found, size_wh) < _MIN_OVERLAP_UNSHARP
-        return found.sharpness >= _MIN_SHARPNESS or is_late
+        return has_changed and sight.index >= placed.keyframe + _MIN_SPACING
 
     def _better_keyframe(
-        self,
-        view: FrameView,
-        levels: ViewLevels,
-        hidden: Sequence[Points],
-        keyframe: int,
-        world_from_frame: Matrix,
+        self, placed: Placed, sight: Sight, world_from_frame: Matrix
     ) -> int | None:
         """A keyframe taken earlier that sees nearly all of the frame, and agrees with it."""
         keyframes = self.graph.keyframes
-        shares = overlapping(keyframes, world_from_frame, view.size_wh, _MIN_REUSED_OVERLAP)
+        shares = overlapping(keyframes, world_from_frame, sight.size_wh, _MIN_REUSED_OVERLAP)
         for _, other in shares[:1]:
-            if other == keyframe:
+            if other == placed.keyframe:
                 continue
             pose = keyframes[other].world_from_keyframe
             guess = geometry.normalized(geometry.inverted(pose) @ world_from_frame)
-            found = align(self._reference(other), levels, guess, hidden)
+            found = align(self._reference(other), sight.levels, guess, sight.hidden)
             if found.reference_from_view is not None:
                 self._go_over(other, found.reference_from_view)
                 return other
         return None
 
-    def _extend(
-        self,
-        view: FrameView,
-        before: _State | None,
-        hidden: Sequence[Points],
-        keyframe: int,
-        found: ViewAlignment,
-    ) -> bool:
+    def _extend(self, placed: Placed, sight: Sight, before: _State | None) -> bool:
         """Take the frame as a keyframe if it is sharp and its place beyond doubt.
 
         It is measured exactly later, unless so little agrees that it must be done at once.
         """
-        if not self._may_be_keyframe(found, view.size_wh):
+        keyframe, found, keyframe_from_frame = placed.keyframe, placed.found, placed.pose
+        is_sharp = found.sharpness >= _MIN_SHARPNESS
+        if not is_sharp and placed.overlap(sight) >= _MIN_OVERLAP_UNSHARP:
             return False
-        assert found.reference_from_view is not None
-        index = view.frame.index
-        reference = self._new_reference(view, before, hidden, keyframe, found)
-        keyframe_from_frame, link = found.reference_from_view, link_of(index, keyframe, found)
+        index = sight.index
+        reference = self._new_reference(placed, sight, before)
+        link = link_of(index, keyframe, found)
         is_sure = found.inliers >= _MIN_AGREEING_CELLS
         if not is_sure:
-            guess = geometry.inverted(found.reference_from_view)
+            guess = geometry.inverted(keyframe_from_frame)
             there = self.graph.keyframes[keyframe].hidden
             exact = align_exactly(reference, self._levels.get(keyframe), guess, there)
             if exact.reference_from_view is None:
                 return False
             keyframe_from_frame = geometry.inverted(exact.reference_from_view)
             link = link_of(keyframe, index, exact)
-        world_from_keyframe = self.graph.keyframes[keyframe].world_from_keyframe
-        world_from_frame = geometry.normalized(world_from_keyframe @ keyframe_from_frame)
-        self._take(view, reference, world_from_frame, link)
+        self._take(sight.view, reference, self._in_world(keyframe, keyframe_from_frame), link)
         self._shear.extend(keyframe, found, index)
         self._go_over(index, np.eye(3))
         self._loops.add(NewKeyframe(index, reference, keyframe, found if is_sure else None))
         return True
 
-    def _new_reference(
-        self,
-        view: FrameView,
-        before: _State | None,
-        hidden: Sequence[Points],
-        keyframe: int,
-        found: ViewAlignment,
-    ) -> ReferenceView:
+    def _new_reference(self, placed: Placed, sight: Sight, before: _State | None) -> ReferenceView:
         """The view of a new keyframe, without what has moved by itself since the frame before."""
-        index, levels = view.frame.index, view.levels
+        levels, hidden = sight.levels, sight.hidden
         reference = ReferenceView(levels, hidden)
+        keyframe = placed.keyframe
         if before is None or before.keyframe != keyframe or not self._doubts.about(keyframe):
             return reference
-        assert found.reference_from_view is not None
-        here_from_before = geometry.inverted(found.reference_from_view) @ before.keyframe_from_frame
-        ours = replace(found, reference_from_view=here_from_before)
+        here_from_before = geometry.inverted(placed.pose) @ before.keyframe_from_frame
+        ours = replace(placed.found, reference_from_view=here_from_before)
         layers = separated(reference, before.levels, ours, hidden)
         if layers.background is not ours or not layers.foreground:
             return reference
-        self._doubts.go_on(index)
+        self._doubts.go_on(sight.index)
         return ReferenceView(levels, (*hidden, *layers.foreground))
 
     def _take(
@@ -365,11 +326,6 @@ def _outlines(tracks: Sequence[Track], levels: ViewLevels) -> list[Points]:
     return [geometry.grown_quad(t.quad, margin_px) for t in tracks if t.quad is not None]
 
 
-def _refused(found: ViewAlignment) -> CameraPose:
-    reason = str(found.verdict).replace("the target", "the keyframe").replace("target", "view")
-    return CameraPose(None, len(found.is_inlier), found.inliers, reason=reason)
-
-
 def _without_jump(found: ViewAlignment, guess: Matrix, size_wh: Size) -> ViewAlignment:
     """The alignment, refused if the view's area is not about what was expected."""
     if found.reference_from_view is None:
@@ -380,13 +336,6 @@ def _without_jump(found: ViewAlignment, guess: Matrix, size_wh: Size) -> ViewAli
     if 1 / _MAX_AREA_JUMP <= area / expected <= _MAX_AREA_JUMP:
         return found
     return replace(found, verdict=Verdict.AREA, reference_from_view=None)
-
-
-def _overlap(found: ViewAlignment, size_wh: Size) -> float:
-    """Share of the view that its reference shows."""
-    assert found.reference_from_view is not None
-    quad = geometry.transform_points(found.reference_from_view, geometry.image_quad(size_wh))
-    return geometry.visible_share(quad, size_wh)
 
 
 def _stretch(world_from_frame: Matrix, size_wh: Size) -> float:

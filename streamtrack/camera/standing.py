@@ -50,9 +50,9 @@ class StandCheck:
         x, y, _ = pixels.points[:, ::_OF_PIXELS]
         self._column, self._row = x.astype(np.intp), y.astype(np.intp)
         self._x, self._y, self._values = x, y, pixels.values[::_OF_PIXELS]
-        j = pixels.jacobian[::_OF_PIXELS]
+        j = pixels.jacobian[:, ::_OF_PIXELS]
         # Translation, zoom and turn, as in view_alignment.
-        self._jacobian = np.stack([j[:, 2], j[:, 5], j[:, 0] + j[:, 4], j[:, 3] - j[:, 1]], axis=1)
+        self._jacobian = np.stack([j[2], j[5], j[0] + j[4], j[3] - j[1]])
         self._unit = float(pixels.unit_from_level[0, 0])
         level_from_view = levels.level_from_view(self._level)
         corners = geometry.image_quad(levels.size_wh)
@@ -74,7 +74,7 @@ class StandCheck:
         wanted, jacobian = self._values, self._jacobian
         if hidden:
             shown = self._shown(levels, hidden)
-            seen, wanted, jacobian = seen[shown], wanted[shown], jacobian[shown]
+            seen, wanted, jacobian = seen[shown], wanted[shown], jacobian[:, shown]
         if len(seen) < _MIN_PIXELS:
             return Stand(float("inf"), len(seen))
         size_seen, size = _median_size(seen), _median_size(wanted)
@@ -127,7 +127,7 @@ def _cell_shifts(pixels: Pixels, residual: npt.NDArray[np.float32]) -> npt.NDArr
     Least squares on the residuals (N,) of its pixels (Lucas & Kanade 1981); NaN without pixels.
     """
     unit = pixels.unit_from_level[0, 0]
-    gx, gy = pixels.jacobian[:, 2] * unit, pixels.jacobian[:, 5] * unit
+    gx, gy = pixels.jacobian[2] * unit, pixels.jacobian[5] * unit
     xx, xy, yy, xr, yr = (
         np.bincount(pixels.cell, product)
         for product in (gx * gx, gx * gy, gy * gy, gx * residual, gy * residual)
@@ -160,17 +160,17 @@ def _cell_correlations(pixels: Pixels, seen: npt.NDArray[np.float32]) -> npt.NDA
 def _robust_step(
     jacobian: npt.NDArray[np.float32], residual: npt.NDArray[np.float32]
 ) -> npt.NDArray[np.float64]:
-    """The change (4,) that explains the residuals best, by Tukey's weights."""
+    """The change (4,) that explains the residuals (N,) best, by Tukey's weights."""
     change = np.zeros(4)
     left = residual
     for _ in range(_ROUNDS):
         noise = 1.4826 * _median_size(left) + 0.3
         share = left / np.float32(4.685 * noise)
         weights = np.maximum(np.float32(0), 1 - share * share) ** 2
-        weighted = jacobian * weights[:, None]
-        normal = (weighted.T @ jacobian).astype(np.float64) + 1e-3 * np.eye(4)
-        change = np.linalg.solve(normal, (weighted.T @ residual).astype(np.float64))
-        left = residual - jacobian @ change.astype(np.float32)
+        weighted = jacobian * weights
+        normal = (weighted @ jacobian.T).astype(np.float64) + 1e-3 * np.eye(4)
+        change = np.linalg.solve(normal, (weighted @ residual).astype(np.float64))
+        left = residual - change.astype(np.float32) @ jacobian
     return change
 
 

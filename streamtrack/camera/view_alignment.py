@@ -29,11 +29,11 @@ from streamtrack.camera.view_levels import (
     Pixels,
     ReferenceView,
     ViewLevels,
-    filled,
+    fill,
 )
 from streamtrack.camera.view_verdict import Fitted, ViewAlignment, judged, refusal
 from streamtrack.registration import judge_mapping
-from streamtrack.types import Mask, Matrix, Model, Points, Verdict
+from streamtrack.types import Image, Matrix, Model, Points, Verdict
 from streamtrack.uncertainty import MODEL_BASES
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
@@ -217,13 +217,12 @@ def _fit(
     values = view.high_passed(level)
     to_reference, to_view = reference.levels.level_from_view(level), view.level_from_view(level)
     mapping = to_view @ start @ geometry.inverted(to_reference)
-    covered = filled(hidden, to_view, values.shape) if hidden else None
-    pixels = _in_view(reference.pixels(level), mapping, values.shape, EDGE_PX[level], covered)
+    pixels = _in_view(reference.pixels(level), mapping, _open(view, level, hidden))
     if len(pixels.values) < _LEAST_PIXELS[level]:
         return None
     basis = _FREEDOMS[level] if basis is None else basis
     is_full = basis.shape[1] == 8
-    jacobian = pixels.jacobian if is_full else pixels.jacobian @ basis.astype(np.float32)
+    jacobian = pixels.jacobian if is_full else basis.T.astype(np.float32) @ pixels.jacobian
     unit, level_from_unit = pixels.unit_from_level, geometry.inverted(pixels.unit_from_level)
     unit_px = level_from_unit[0, 0]
     prior = basis.T @ _PRIOR @ basis
@@ -232,9 +231,9 @@ def _fit(
     for _ in range(_ROUNDS[level]):
         seen = _sampled(values, mapping, pixels.points)
         residual, precisions = _residuals(pixels.values, seen)
-        weighted = jacobian * precisions[:, None]
-        normal = (weighted.T @ jacobian).astype(np.float64) + prior
-        gradient = (residual @ weighted).astype(np.float64) - prior @ change
+        weighted = jacobian * precisions
+        normal = (weighted @ jacobian.T).astype(np.float64) + prior
+        gradient = (weighted @ residual).astype(np.float64) - prior @ change
         try:
             step = np.linalg.solve(normal, gradient)
         except np.linalg.LinAlgError:
@@ -290,30 +289,24 @@ def _make_prior() -> Doubles:
 _PRIOR = _make_prior()
 
 
-def _in_view(
-    pixels: Pixels,
-    mapping: Matrix,
-    shape: tuple[int, ...],
-    edge: int,
-    covered: Mask | None,
-) -> Pixels:
-    """Those of the pixels that the view shows, off its edge and where (h, w) it is not covered."""
+def _open(view: ViewLevels, level: int, hidden: Sequence[Points]) -> Image:
+    """Where (h, w) a level of a view tells something of the scene: 1, at its edge and elsewhere 0.
+
+    ``hidden`` are quads (4, 2) in the view that do not belong to the scene.
+    """
+    shape, edge = view.images[level].shape, EDGE_PX[level]
+    told = np.zeros(shape, np.uint8)
+    told[edge : -edge - 1, edge : -edge - 1] = 1
+    fill(told, hidden, view.level_from_view(level), 0)
+    return told
+
+
+def _in_view(pixels: Pixels, mapping: Matrix, told: Image) -> Pixels:
+    """Those of the pixels that ``mapping`` takes to where a level of a view is 1 (h, w)."""
     x, y, depth = _projected(mapping, pixels.points)
-    height, width = shape
-    inside = (x >= edge) & (y >= edge) & (x < width - 1 - edge) & (y < height - 1 - edge)
-    inside &= depth > 0
-    if covered is not None:
-        inside[inside] = ~covered[_rounded(y[inside]), _rounded(x[inside])]
-    if inside.all():
-        return pixels
-    rows = np.flatnonzero(inside)
-    return Pixels(
-        pixels.points[:, rows],
-        pixels.values[rows],
-        pixels.jacobian[rows],
-        pixels.cell[rows],
-        pixels.unit_from_level,
-    )
+    is_told = cv2.remap(told, x[None], y[None], cv2.INTER_NEAREST, borderValue=0)
+    rows = np.flatnonzero((depth > 0) & (np.asarray(is_told)[0] > 0))
+    return pixels if len(rows) == len(x) else pixels.of(rows)
 
 
 def _projected(mapping: Matrix, points: Floats) -> tuple[Floats, Floats, Floats]:
@@ -321,10 +314,6 @@ def _projected(mapping: Matrix, points: Floats) -> tuple[Floats, Floats, Floats]
     moved = mapping.astype(np.float32) @ points
     with np.errstate(divide="ignore", invalid="ignore"):
         return moved[0] / moved[2], moved[1] / moved[2], moved[2]
-
-
-def _rounded(values: Floats) -> npt.NDArray[np.intp]:
-    return (values + np.float32(0.5)).astype(np.intp)
 
 
 def _sampled(values: Floats, mapping: Matrix, points: Floats) -> Floats:

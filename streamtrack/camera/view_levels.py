@@ -88,7 +88,7 @@ class Pixels:
 
     points     float32 (3, N), level pixels, with ones
     values     float32 (N,), high-passed grey values
-    jacobian   float32 (N, 8), change of a value with each parameter of a homography in units
+    jacobian   float32 (8, N), change of a value with each parameter of a homography in units
     cell       int (N,), the cell each lies in, rising
     """
 
@@ -97,6 +97,16 @@ class Pixels:
     jacobian: Floats
     cell: Rows
     unit_from_level: Matrix
+
+    def of(self, rows: Rows) -> Pixels:
+        """Those of the pixels in the rows (M,), which rise."""
+        return Pixels(
+            self.points.take(rows, axis=1),
+            self.values.take(rows),
+            self.jacobian.take(rows, axis=1),
+            self.cell.take(rows),
+            self.unit_from_level,
+        )
 
 
 class ReferenceView:
@@ -118,7 +128,7 @@ class ReferenceView:
     @property
     def textured_cells(self) -> int:
         """Cells that hold enough texture to be judged."""
-        return len(np.unique(self.pixels(USUAL).cell))
+        return int(np.count_nonzero(np.diff(self.pixels(USUAL).cell, prepend=-1)))
 
     def pixels(self, level: int) -> Pixels:
         """The chosen pixels of a level, chosen when first asked for."""
@@ -130,11 +140,16 @@ class ReferenceView:
 def filled(quads: Sequence[Points], picture_from_view: Matrix, shape: tuple[int, ...]) -> Mask:
     """Which pixels (h, w) of a picture lie in quads (4, 2) of a view; not finite ones are none."""
     inside = np.zeros(shape, np.uint8)
+    fill(inside, quads, picture_from_view, 1)
+    return inside > 0
+
+
+def fill(picture: Image, quads: Sequence[Points], picture_from_view: Matrix, value: int) -> None:
+    """Set the pixels (h, w) that lie in quads (4, 2) of a view; not finite ones are none."""
     for quad in quads:
         seen = geometry.transform_points(picture_from_view, quad)
         if np.isfinite(seen).all():
-            cv2.fillConvexPoly(inside, np.rint(np.clip(seen, -1e6, 1e6)).astype(np.int32), 1)
-    return inside > 0
+            cv2.fillConvexPoly(picture, np.rint(np.clip(seen, -1e6, 1e6)).astype(np.int32), value)
 
 
 def _choose_pixels(
@@ -163,7 +178,7 @@ def _choose_pixels(
     u, v = gx[row, column] / unit, gy[row, column] / unit
     radial = u * x + v * y
     parts = [u * x, u * y, u, v * x, v * y, v, -x * radial, -y * radial]
-    jacobian = np.stack(parts, axis=1).astype(np.float32)
+    jacobian = np.stack(parts).astype(np.float32)
     return Pixels(points, values[row, column], jacobian, cell, unit_from_level)
 
 

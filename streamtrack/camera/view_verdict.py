@@ -136,7 +136,7 @@ def _cells(fitted: Fitted, max_shift_px: float) -> _Cells:
     starts = np.flatnonzero(np.diff(pixels.cell, prepend=-1))
     wanted, got = pixels.values, fitted.seen
     unit = np.float32(pixels.unit_from_level[0, 0])
-    gx, gy = pixels.jacobian[:, 2] * unit, pixels.jacobian[:, 5] * unit
+    gx, gy = pixels.jacobian[2] * unit, pixels.jacobian[5] * unit
     r = fitted.residual
     x, y, one = pixels.points
     terms = [one, x, y, wanted, got, wanted * wanted, got * got, wanted * got]

@@ -1,0 +1,74 @@
+"""A frame as the camera's motion is asked of it, and what it came to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from streamtrack import geometry
+from streamtrack.camera.view_levels import ViewLevels
+from streamtrack.camera.view_verdict import ViewAlignment
+from streamtrack.frame_view import FrameView
+from streamtrack.types import CameraPose, Matrix, Points, Size, Verdict
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """A frame, and quads (4, 2) in it that do not belong to the scene."""
+
+    view: FrameView
+    hidden: Sequence[Points]
+
+    @property
+    def index(self) -> int:
+        return self.view.frame.index
+
+    @property
+    def time_s(self) -> float:
+        return self.view.frame.time_s
+
+    @property
+    def levels(self) -> ViewLevels:
+        return self.view.levels
+
+    @property
+    def size_wh(self) -> Size:
+        return self.view.size_wh
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """A frame as it was aligned with a keyframe."""
+
+    keyframe: int
+    found: ViewAlignment
+
+    @property
+    def keyframe_from_frame(self) -> Matrix | None:
+        """None if the alignment was refused."""
+        return self.found.reference_from_view
+
+    @property
+    def pose(self) -> Matrix:
+        """``keyframe_from_frame`` of one that was not refused."""
+        assert self.found.reference_from_view is not None
+        return self.found.reference_from_view
+
+    def overlap(self, sight: Sight) -> float:
+        """Share of the frame that the keyframe shows."""
+        quad = geometry.transform_points(self.pose, geometry.image_quad(sight.size_wh))
+        return geometry.visible_share(quad, sight.size_wh)
+
+    def camera_pose(
+        self, world_from_frame: Matrix | None, why: Verdict | None = None
+    ) -> CameraPose:
+        """The pose with its evidence, or why there is none."""
+        found, reason = self.found, "" if why is None else str(why)
+        return CameraPose(
+            world_from_frame, len(found.is_inlier), found.inliers, found.rmse_px, reason
+        )
+
+    def refusal(self) -> CameraPose:
+        found = self.found
+        reason = str(found.verdict).replace("the target", "the keyframe").replace("target", "view")
+        return CameraPose(None, len(found.is_inlier), found.inliers, reason=reason)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from math import hypot, log
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -49,6 +50,22 @@ def fit_robustly(
     return b_from_a, transfer_errors(b_from_a, a, b) < threshold_px
 
 
+def solved(normal: Doubles, gradient: Doubles) -> Doubles | None:
+    """The step (k,) of a least-squares problem with normal matrix (k, k); None if there is none.
+
+    By OpenCV's Cholesky decomposition: for so few freedoms LAPACK would be mostly overhead.
+    """
+    is_solved, column = cv2.solve(normal, gradient[:, None], flags=cv2.DECOMP_CHOLESKY)
+    step: Doubles = np.asarray(column, np.float64).ravel()
+    return step if is_solved and np.isfinite(step).all() else None
+
+
+def step_matrix(step: Doubles) -> Matrix:
+    """The homography that is off the identity by h11 .. h32 (8,)."""
+    a, b, c, d, e, f, g, h = step.tolist()
+    return np.array([[1 + a, b, c], [d, 1 + e, f], [g, h, 1.0]])
+
+
 def _biweights(errors: Doubles, threshold_px: float) -> Doubles:
     """Tukey's biweight of each error (M,), its scale taken from the errors below the threshold."""
     near = errors[errors < threshold_px]
@@ -72,9 +89,11 @@ def median(values: npt.NDArray[Any]) -> float:
 
 def fit(model: Model, a: Points, b: Points, weights: Doubles | None = None) -> Matrix:
     """Weighted least-squares mapping of a model from pairs (M, 2); ``weights`` (M,)."""
-    w = np.ones(len(a)) if weights is None else np.asarray(weights, np.float64)
-    used = w > 0
-    pa, pb, w = a[used].astype(np.float64), b[used].astype(np.float64), w[used]
+    pa, pb = a.astype(np.float64), b.astype(np.float64)
+    w = np.ones(len(a))
+    if weights is not None:
+        used = weights > 0
+        pa, pb, w = pa[used], pb[used], np.asarray(weights[used], np.float64)
     if model is Model.TRANSLATION:
         return geometry.translation(*_mean(pb - pa, w))
     if model is Model.SIMILARITY:

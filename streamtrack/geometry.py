@@ -32,12 +32,11 @@ def transform_points(b_from_a: Matrix, points: npt.ArrayLike) -> Points:
             mapped.extend(((a * x + b * y + c) / depth, (d * x + e * y + f) / depth))
         else:
             return np.frombuffer(mapped, np.float32).reshape(-1, 2)
-    x, y = np.ascontiguousarray(pts.T, np.float64)
+    matrix = np.asarray(b_from_a, np.float64)
     result: Points = np.empty((len(pts), 2), np.float32)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        depth = g * x + h * y + i
-        result[:, 0] = (a * x + b * y + c) / depth
-        result[:, 1] = (d * x + e * y + f) / depth
+        u, v, depth = matrix[:, :2] @ np.ascontiguousarray(pts.T, np.float64) + matrix[:, 2:]
+        result[:, 0], result[:, 1] = u / depth, v / depth
     return result
 
 

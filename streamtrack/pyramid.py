@@ -10,6 +10,7 @@ from math import log2
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.types import Image, Matrix, Size
@@ -60,3 +61,10 @@ class Pyramid:
             coarser = cv2.resize(finer, size, interpolation=cv2.INTER_AREA)
             self._levels.append(np.asarray(coarser, np.uint8))
         return self._levels[octave]
+
+
+def high_passed(image: Image, window_px: int) -> npt.NDArray[np.float32]:
+    """Grey values (H, W), slightly smoothed, minus their mean in the window around."""
+    smooth = cv2.GaussianBlur(image, (3, 3), 0.8)
+    around = cv2.boxFilter(smooth, cv2.CV_32F, (window_px, window_px))
+    return np.asarray(cv2.subtract(smooth, around, dtype=cv2.CV_32F), np.float32)

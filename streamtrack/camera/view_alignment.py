@@ -32,6 +32,7 @@ from streamtrack.camera.view_levels import (
     fill,
 )
 from streamtrack.camera.view_verdict import Fitted, ViewAlignment, judged, refusal
+from streamtrack.fitting import solved, step_matrix
 from streamtrack.registration import judge_mapping
 from streamtrack.types import Image, Matrix, Model, Points, Verdict
 from streamtrack.uncertainty import MODEL_BASES
@@ -42,8 +43,8 @@ _LEAST_PIXELS = (1000, 250, 60, 30, 20)  # in view, by level
 _ROUNDS = (6, 8, 4, 4, 4)  # at most, by level
 _SAME_PX = 0.5  # of a level: starts that differ by no more lead to the same end
 _MAX_LAST_STEP_PX = 1.0  # of a fit that counts as converged
-_CONVERGED_PX = 0.01
-_CONVERGED_COARSE_PX = 0.15
+_CONVERGED_PX = 0.04  # what a further step would still move is about a tenth of it
+_CONVERGED_COARSE_PX = 0.3
 _PERSPECTIVE_SIGMA = 0.05  # of the change against the guess, in units of half a view
 _SHAPE_SIGMA = 0.15
 _MIN_SHAPE_SHARE = 0.6  # of agreeing cells, for a mapping richer than a similarity
@@ -234,16 +235,14 @@ def _fit(
         weighted = jacobian * precisions
         normal = (weighted @ jacobian.T).astype(np.float64) + prior
         gradient = (weighted @ residual).astype(np.float64) - prior @ change
-        try:
-            step = np.linalg.solve(normal, gradient)
-        except np.linalg.LinAlgError:
-            return None
-        if not np.abs(step).max() < 0.5:
+        step = solved(normal, gradient)
+        most = np.inf if step is None else float(np.abs(step).max())
+        if step is None or not most < 0.5:
             return None
         change += step
-        unit_step = np.eye(3) + np.append(basis @ step, 0.0).reshape(3, 3)
+        unit_step = step_matrix(basis @ step)
         mapping = mapping @ geometry.inverted(level_from_unit @ unit_step @ unit)
-        moved_px = float(np.abs(step).max() * unit_px)
+        moved_px = most * unit_px
         if moved_px < (_CONVERGED_PX if level <= USUAL else _CONVERGED_COARSE_PX):
             break
     found = geometry.inverted(to_view) @ mapping @ to_reference

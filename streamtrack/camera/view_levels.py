@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
+from streamtrack.pyramid import high_passed
 from streamtrack.types import Image, Mask, Matrix, Points, Size
 
 Floats: TypeAlias = npt.NDArray[np.float32]
@@ -26,6 +27,7 @@ _HIGH_PASS_PX = 25
 EDGE_PX = (9, 3, 3, 3, 3)
 """Left out at the edges, by level: local means reach over them, and keyframes' links feel that."""
 _MIN_GRADIENT = 0.8  # grey levels a pixel, RMS of a cell's chosen pixels
+_TINY = np.finfo(np.float32).tiny
 
 
 class ViewLevels:
@@ -59,9 +61,7 @@ class ViewLevels:
             level = USUAL
         found = self._high_passed.get(level)
         if found is None:
-            smooth = cv2.GaussianBlur(self.images[level], (3, 3), 0.8).astype(np.float32)
-            window = (_HIGH_PASS_PX, _HIGH_PASS_PX)
-            found = np.asarray(smooth - cv2.blur(smooth, window), np.float32)
+            found = high_passed(self.images[level], _HIGH_PASS_PX)
             if level != EXACT:  # large, and needed once or twice
                 self._high_passed[level] = found
         return found
@@ -169,35 +169,35 @@ def _choose_pixels(
         strength[spread > 0] = 0
     row, column, cell = _strongest(strength, _CELL_PIXELS[level])
     height, width = values.shape
-    unit = 2.0 / max(width, height)
+    unit = np.float32(2.0 / max(width, height))
     unit_from_level = np.array(
         [[unit, 0, -unit * (width - 1) / 2], [0, unit, -unit * (height - 1) / 2], [0, 0, 1]]
     )
+    places = row * width + column
     points = np.stack([column, row, np.ones_like(row)]).astype(np.float32)
-    x, y = column * unit + unit_from_level[0, 2], row * unit + unit_from_level[1, 2]
-    u, v = gx[row, column] / unit, gy[row, column] / unit
+    x, y, _ = unit_from_level.astype(np.float32) @ points
+    u, v = (gradient.take(places) / unit for gradient in (gx, gy))
     radial = u * x + v * y
-    parts = [u * x, u * y, u, v * x, v * y, v, -x * radial, -y * radial]
-    jacobian = np.stack(parts).astype(np.float32)
-    return Pixels(points, values[row, column], jacobian, cell, unit_from_level)
+    jacobian = np.stack([u * x, u * y, u, v * x, v * y, v, -x * radial, -y * radial])
+    return Pixels(points, values.take(places), jacobian, cell, unit_from_level)
 
 
 def _strongest(strength: Floats, count: int) -> tuple[Rows, Rows, Rows]:
-    """Row, column and cell of the ``count`` strongest pixels of every cell that has texture."""
+    """Row, column and cell of the ``count`` strongest pixels of every cell that has texture.
+
+    What is as strong as the last of them is taken, too.
+    """
     height, width = strength.shape
     across, down = _CELLS
     cell_w, cell_h = -(-width // across), -(-height // down)
     padded = np.zeros((down * cell_h, across * cell_w), np.float32)
     padded[:height, :width] = strength
     cells = padded.reshape(down, cell_h, across, cell_w).swapaxes(1, 2).reshape(down * across, -1)
-    count = min(count, cells.shape[1])
-    best = np.argpartition(-cells, count - 1, axis=1)[:, :count]
-    best.sort(axis=1)
-    chosen = np.take_along_axis(cells, best, axis=1)
-    is_textured = chosen.mean(axis=1) >= _MIN_GRADIENT**2
-    cell = np.broadcast_to(np.arange(len(cells))[:, None], best.shape)
-    kept = (chosen > 0) & is_textured[:, None]
-    within, cell = best[kept], cell[kept]
+    first = max(cells.shape[1] - count, 0)
+    best = np.partition(cells, first, axis=1)[:, first:]
+    is_textured = best.mean(axis=1) >= _MIN_GRADIENT**2
+    least = np.where(is_textured, np.maximum(best[:, 0], _TINY), np.inf).astype(np.float32)
+    cell, within = np.divmod(np.flatnonzero(cells >= least[:, None]), cells.shape[1])
     row = (cell // across) * cell_h + within // cell_w
     column = (cell % across) * cell_w + within % cell_w
-    return row.astype(np.intp), column.astype(np.intp), cell.astype(np.intp)
+    return row, column, cell

@@ -139,9 +139,13 @@ def _cells(fitted: Fitted, max_shift_px: float) -> _Cells:
     gx, gy = pixels.jacobian[2] * unit, pixels.jacobian[5] * unit
     r = fitted.residual
     x, y, one = pixels.points
-    terms = [one, x, y, wanted, got, wanted * wanted, got * got, wanted * got]
-    terms += [gx * gx, gy * gy, gx * gy, gx * r, gy * r]
-    sums = np.add.reduceat(np.stack(terms), starts, axis=1).astype(np.float64)
+    terms = np.stack(
+        [
+            *(one, x, y, wanted, got, wanted * wanted, got * got, wanted * got),
+            *(gx * gx, gy * gy, gx * gy, gx * r, gy * r),
+        ]
+    )
+    sums = np.add.reduceat(terms, starts, axis=1).astype(np.float64)
     n, sum_x, sum_y, w, g, ww, gg, wg, xx, yy, xy, rx, ry = sums
     covariance = wg / n - w * g / n**2
     variances = np.maximum(ww / n - (w / n) ** 2, 0) * np.maximum(gg / n - (g / n) ** 2, 0)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from streamtrack.fitting import median
 from streamtrack.tracking.refine import contrast_gain
 from streamtrack.tracking.template import CORRELATION_WINDOW, Patch, window_means
 from streamtrack.types import Image, Mask
@@ -85,7 +86,7 @@ def shift_left(patch: Patch, smooth: Floats, rows: Rows, columns: Rows, visible:
     warped back and high-passed.
     """
     ours = patch.gradients
-    contrast = float(np.median(np.abs(ours.smooth[rows, columns])))
+    contrast = median(np.abs(ours.smooth[rows, columns]))
     residual = contrast_gain(contrast, smooth[rows, columns]) * smooth - ours.smooth
     x, y = (
         window_means(np.asarray(cv2.multiply(gradient, residual), np.float32))[rows, columns]

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from streamtrack.fitting import solved, step_matrix
 from streamtrack.geometry import (
     image_quad,
     inverted,
@@ -24,6 +25,7 @@ from streamtrack.geometry import (
     normalized,
     transform_points,
 )
+from streamtrack.pyramid import high_passed
 from streamtrack.types import Image, Mask, Matrix, Model, Points
 from streamtrack.uncertainty import MODEL_BASES, motion_rows
 
@@ -47,7 +49,7 @@ class Gradients:
 
     index            int (N,), places in the flattened patch
     values           float32 (N,), high-passed grey values there
-    jacobian         float32 (N, 8), change of a value with each parameter of a homography
+    jacobian         float32 (8, N), change of a value with each parameter of a homography
     unit_from_patch  the coordinates in which those parameters are well scaled
     smooth, gx, gy   float32 (h, w), the high-passed patch and its derivatives a pixel
     """
@@ -125,10 +127,11 @@ def refined(
         return None
     index, values, jacobian = gradients.index, gradients.values, gradients.jacobian
     if not support.all():
-        index, values, jacobian = index[support], values[support], jacobian[support]
+        rows = np.flatnonzero(support)
+        index, values, jacobian = index[rows], values[rows], jacobian.take(rows, axis=1)
     basis = MODEL_BASES[model]
     if model is not Model.HOMOGRAPHY:
-        jacobian = jacobian @ basis.astype(np.float32)
+        jacobian = basis.T.astype(np.float32) @ jacobian
     unit_from_patch = gradients.unit_from_patch
     patch_from_unit = inverted(unit_from_patch)
     template_from_patch = inverted(patch_from_template)
@@ -137,17 +140,16 @@ def refined(
     moved_px = 0.0
     for left in reversed(range(_ROUNDS)):
         seen_through, image = pose, warp_back(pose)
-        smooth = _high_passed(image)
+        smooth = high_passed(image, _HIGH_PASS_PX)
         seen = smooth.ravel().take(index)
         normal, gradient = _normal_equations(jacobian, values, contrast, seen)
         if expected is not None:
             normal = normal + basis.T @ expected.normal @ basis
             gradient = gradient + basis.T @ expected.gradient(pose)
-        try:
-            step = np.linalg.solve(normal, gradient)
-        except np.linalg.LinAlgError:
+        step = solved(normal, gradient)
+        if step is None:
             return None
-        unit_step = np.eye(3) + np.append(basis @ step, 0.0).reshape(3, 3)
+        unit_step = step_matrix(basis @ step)
         patch_step = patch_from_unit @ unit_step @ unit_from_patch
         change_px = largest_shift(patch_step, image_quad((image.shape[1], image.shape[0])))
         moved_px += change_px
@@ -175,8 +177,8 @@ def _normal_equations(
     np.maximum(weights, 0, out=weights)
     weights *= weights
     weights *= np.float32(1 / noise**2)
-    weighted = (jacobian * weights[:, None]).T
-    normal = (weighted @ jacobian).astype(np.float64)
+    weighted = jacobian * weights
+    normal = (weighted @ jacobian.T).astype(np.float64)
     normal[np.diag_indices(len(normal))] *= 1 + 1e-6
     return normal, (weighted @ residual).astype(np.float64)
 
@@ -224,7 +226,7 @@ def _expectation(prior: Prior, pose: Matrix, unit_from_template: Matrix) -> _Exp
 
 def _derivatives(image: Image) -> tuple[Floats, Floats, Floats]:
     """The high-passed values (h, w) and their derivatives a pixel along x and y."""
-    smooth = _high_passed(image)
+    smooth = high_passed(image, _HIGH_PASS_PX)
     gx = np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8), np.float32)
     gy = np.asarray(cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8), np.float32)
     return smooth, gx, gy
@@ -249,12 +251,6 @@ def _gradients_at(index: npt.NDArray[np.intp], smooth: Floats, gx: Floats, gy: F
     )
 
 
-def _high_passed(image: Image) -> Floats:
-    """Grey values, slightly smoothed, minus their local mean."""
-    values = cv2.GaussianBlur(image, (3, 3), 0.8).astype(np.float32)
-    return np.asarray(values - cv2.blur(values, (_HIGH_PASS_PX, _HIGH_PASS_PX)), np.float32)
-
-
 def _informative(strength: Floats, inside: Mask) -> npt.NDArray[np.intp]:
     """Places of the strongest gradients, each judged against its surroundings."""
     strength = np.where(inside, strength, np.float32(0))
@@ -271,8 +267,8 @@ def _jacobian(
 ) -> Floats:
     """Gradient times the derivative of a homography at the identity (Baker & Matthews, eq. 99)."""
     radial = gx * x + gy * y
-    columns: list[npt.NDArray[np.floating[Any]]] = [
+    rows: list[npt.NDArray[np.floating[Any]]] = [
         *(gx * x, gx * y, gx, gy * x, gy * y, gy),
         *(-x * radial, -y * radial),
     ]
-    return np.stack(columns, axis=1).astype(np.float32)
+    return np.stack(rows).astype(np.float32)

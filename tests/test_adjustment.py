@@ -153,6 +153,54 @@ def test_a_long_way_is_not_bent_for_the_mean_of_slow_tilts(count: int, tilt: flo
     assert max(graph.errors(found.world_from_picture)) < max(graph.errors(graph.start)) / 2
 
 
+def from_above(x: float, tilt_deg: float, roll_deg: float, focal_px: float) -> Matrix:
+    """world_from_picture of a real camera over a plane, aimed at (x, 0) and tilted."""
+    tilt, roll = np.deg2rad((tilt_deg, roll_deg))
+    nod = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    lean = np.array([[np.cos(roll), 0, np.sin(roll)], [0, 1, 0], [-np.sin(roll), 0, np.cos(roll)]])
+    turn = nod @ lean
+    lens = np.array([[focal_px, 0, 320], [0, focal_px, 240], [0, 0, 1]])
+    picture_from_plane = lens @ np.column_stack([turn[:, :2], turn[:, 2] * focal_px])
+    pose = geometry.inverted(picture_from_plane)
+    aim = geometry.transform_points(pose, [[320, 240]])[0]
+    return geometry.translation(x - aim[0], -aim[1]) @ pose
+
+
+def tilted_way(mean_deg: float, swing_deg: float, focal_px: float, seed: int) -> Graph:
+    """A chain of links along a way of 8000 px, the rough poses its product."""
+    rng = np.random.default_rng(seed)
+    poses = []
+    for i in range(40):
+        nod, lean = mean_deg + swing_deg * np.sin(i / 7), swing_deg * np.cos(i / 5)
+        poses.append(from_above(200.0 * i, nod, lean, focal_px))
+    first = geometry.inverted(poses[0])
+    truth = {i: geometry.normalized(first @ pose) for i, pose in enumerate(poses)}
+    start, links = {0: np.eye(3)}, []
+    for i in range(1, len(truth)):
+        one = link(i, i - 1, between(truth, i, i - 1), rng, 0.03)
+        own = fit(Model.HOMOGRAPHY, one.a_points, one.b_points)
+        links.append(linked(i, i - 1, one.a_points, one.b_points, own))
+        start[i] = geometry.normalized(start[i - 1] @ own)
+    return Graph(truth, start, links)
+
+
+@pytest.mark.parametrize(
+    ("mean_deg", "swing_deg", "focal_px"), [(0, 1, 704.0), (0, 4, 704.0), (20, 3, 900.0)]
+)
+def test_tilted_pictures_tell_where_level_is(
+    mean_deg: float, swing_deg: float, focal_px: float
+) -> None:
+    """The errors of a chain add up; what each picture shows of the plane's tilt does not."""
+    before, after = [], []
+    for seed in range(4):
+        graph = tilted_way(mean_deg, swing_deg, focal_px, seed)
+        start, links = graph.start, graph.links
+        found = adjust(start, links, graph.sizes, 0, Model.HOMOGRAPHY, is_near=True)
+        before += graph.errors(start)
+        after += graph.errors(found.world_from_picture)
+    assert np.mean(after) < 0.75 * np.mean(before)
+
+
 def test_a_homography_does_not_drift_where_a_similarity_would_do() -> None:
     """The gauge that links leave open is held by what the poses have in common."""
     graph = flight(count=40)

@@ -14,7 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 from streamtrack.camera import keyframe_links
-from streamtrack.camera.keyframe_links import Draft, LevelCache, NewKeyframe
+from streamtrack.camera.keyframe_links import Draft, Joined, LevelCache, NewKeyframe
 from streamtrack.camera.keyframes import KeyframeGraph
 
 _LINK_FRAMES = 4  # after which the result of linking a keyframe is taken over
@@ -74,7 +74,7 @@ class LoopCloser:
                 if self._job is not None:
                     self._take_over(self._job)
                 self._begin()
-            if len(self._graph.links) >= len(self._graph.keyframes) > 2:  # no mere chain
+            if len(self._graph.keyframes) > 2:
                 draft = Draft(self._graph)
                 keyframe_links.adjust_all(draft)
                 draft.publish(self._graph)
@@ -115,20 +115,22 @@ class LoopCloser:
 
     def _link(self, draft: Draft, new: NewKeyframe) -> bool:
         keyframe_links.measure_exactly(draft, new, self._levels.get(new.chained_to))
-        before = self._compared
-        if before is not None and keyframe_links.shows_the_same(
-            draft, new.index, before, _MAX_SAME_PLACE
-        ):
-            return False
-        self._compared = new.index
-        found = keyframe_links.join(draft, new, self._levels)
-        if not found:
-            return False
-        keyframe_links.adjust_around(draft)
+        found = self._joined(draft, new)
+        if found:
+            keyframe_links.adjust_around(draft)
         growth = len(draft.keyframes) / self._adjusted_at
         is_surprise = any(one.is_loop and one.surprise_px > _MAX_SURPRISE_PX for one in found)
         is_grown = growth >= _GROWTH + 4 / self._adjusted_at
         return is_grown or (is_surprise and growth >= _LEAST_GROWTH)
+
+    def _joined(self, draft: Draft, new: NewKeyframe) -> list[Joined]:
+        before = self._compared
+        if before is not None and keyframe_links.shows_the_same(
+            draft, new.index, before, _MAX_SAME_PLACE
+        ):
+            return []
+        self._compared = new.index
+        return keyframe_links.join(draft, new, self._levels)
 
     def _adjust_all(self, draft: Draft) -> bool:
         keyframe_links.adjust_all(draft)

@@ -1,11 +1,9 @@
 """Global adjustment of a flat mosaic: one pose a picture that all links agree with best.
 
 A homography for each picture lets the mosaic's perspective drift, because links fix only what
-pictures have in common: any further homography applied to all poses leaves every residual as it
-is, and small errors of the links add up along it. So the models are climbed from poor to rich
-(after Elibol et al., who go from similarities to homographies in two steps), and what a pose has
-beyond a similarity is held near zero by a prior whose width is that of the links' own mappings,
-or of the poses if that is more: flat flights hold it tight, a camera that turns loosens it.
+pictures have in common. So the models are climbed from poor to rich (after Elibol et al., who go
+from similarities to homographies in two steps), the world is laid level (`mosaic.levelling`), and
+poses are held to what a camera with square pixels can show of a plane (`mosaic.prior`).
 """
 
 from __future__ import annotations

@@ -18,7 +18,8 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from streamtrack.mosaic.prior import DEVIATION_ROWS, deviations, of_each_kind, prior_precisions
+from streamtrack.mosaic.levelling import levelled
+from streamtrack.mosaic.prior import NO_PRIOR, Prior, first_prior
 from streamtrack.types import Mask, Model
 from streamtrack.uncertainty import MODEL_BASES, motion_rows
 
@@ -79,21 +80,6 @@ class Problem:
         tells: Mask = np.sqrt(squares / pairs) > MIN_NOISE_PX
         return tells if np.mean(tells) > _MIN_EXPOSURES else np.ones_like(tells)
 
-    @cached_property
-    def _noise_gains(self) -> Doubles:
-        """Variances (4,) of `deviations` in the links' own mappings for noise of 1 px."""
-        _, by_a, _ = _change_of_points(self, self.own)
-        weighted = by_a * self.counts[..., None, None]
-        normal = np.einsum("lkic,lkid->lcd", weighted, by_a)
-        both = _of_links(normal) + 1e-9 * np.eye(8)
-        covariance = DEVIATION_ROWS @ np.linalg.inv(both) @ DEVIATION_ROWS.T
-        usual = np.median(np.diagonal(covariance, axis1=1, axis2=2), axis=0)
-        return of_each_kind(usual)
-
-    def noise_variances(self, noise_px: float) -> Doubles:
-        """Of the four measures of `prior.deviations` in the links' own mappings, (4,)."""
-        return self._noise_gains * noise_px**2
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
@@ -119,14 +105,6 @@ def _of_links(values: Doubles) -> Doubles:
     return total
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Weights:
-    """What each pair (2 L, K) counts, a square pixel's worth, and the prior's precisions (4,)."""
-
-    pairs: Doubles
-    prior: Doubles
-
-
 def solve(
     problem: Problem,
     start: Doubles,
@@ -137,17 +115,24 @@ def solve(
     """Levenberg-Marquardt from ``start``, reweighted at each of at most ``rounds`` rounds.
 
     ``is_graduated`` lets all links count at first; else the start tells good links from wrong.
+    Homographies that no held pose fixes are laid level before (see `mosaic.levelling`).
     """
+    unit, prior = problem.unit_from_picture, NO_PRIOR
+    if problem.anchor is not None and model in (Model.AFFINE, Model.HOMOGRAPHY):
+        prior = first_prior(0.0)
+        if model is Model.HOMOGRAPHY:
+            level = levelled(start, unit, problem.anchor)
+            start, prior = level.poses, first_prior(level.focal)
     poses, errors = start, _errors(problem, start)
     damping, rejection = _DAMPING, _Rejection(problem, errors, is_graduated)
     for tried in range(rounds):
-        weights = _weights(problem, poses, errors, rejection)
-        before = _cost(problem, weights, poses, errors, model)
+        weights = _weights(problem, errors, rejection)
+        before = _cost(problem, weights, poses, errors, prior)
         while True:
-            change = _step(problem, poses, weights, model, damping)
+            change = _step(problem, poses, weights, prior, model, damping)
             moved = _moved(problem, poses, change)
             moved_errors = _errors(problem, moved)
-            if _cost(problem, weights, moved, moved_errors, model) <= before:
+            if _cost(problem, weights, moved, moved_errors, prior) <= before:
                 break
             damping *= 10
             if damping > _MAX_DAMPING:
@@ -155,6 +140,8 @@ def solve(
         damping = max(damping / 10, _DAMPING)
         moved_px = float(np.max(np.abs(change) * problem.unit_px[:, None]))
         poses, errors = moved, moved_errors
+        if prior is not NO_PRIOR:
+            prior = prior.learned(poses, unit)
         is_final = rejection.tighten(errors)
         if moved_px < _CONVERGED_PX and is_final and tried > 2:
             break
@@ -215,30 +202,25 @@ def estimated_noise_px(problem: Problem, errors: Doubles, is_used: Mask | None =
     return max(MIN_NOISE_PX, float(np.median(alone)) / 1.1774)
 
 
-def _weights(problem: Problem, poses: Doubles, errors: Doubles, rejection: _Rejection) -> _Weights:
+def _weights(problem: Problem, errors: Doubles, rejection: _Rejection) -> Doubles:
+    """What each pair (2 L, K) counts, a square pixel's worth."""
     noise_px = estimated_noise_px(problem, errors)
     # The mean of n pairs is worth n of them, as far as their errors are independent.
     alone = errors * np.sqrt(problem.counts)
     with np.errstate(divide="ignore", invalid="ignore"):
         huber = np.nan_to_num(np.minimum(1.0, 2 * _HUBER * noise_px / alone))
     of_link = rejection.weights(errors)
-    pairs = huber * problem.counts * np.concatenate([of_link, of_link])[:, None] / noise_px**2
-    unit = problem.unit_from_picture
-    precisions = prior_precisions(
-        deviations(poses, unit),
-        deviations(problem.own, unit[problem.a]),
-        problem.noise_variances(noise_px),
-    )
-    return _Weights(pairs, precisions)
+    both = np.concatenate([of_link, of_link])[:, None]
+    weights: Doubles = huber * problem.counts * both / noise_px**2
+    return weights
 
 
 def _cost(
-    problem: Problem, weights: _Weights, poses: Doubles, errors: Doubles, model: Model
+    problem: Problem, weights: Doubles, poses: Doubles, errors: Doubles, prior: Prior
 ) -> float:
-    is_counted = weights.pairs > 0
-    cost = float(np.sum(weights.pairs[is_counted] * errors[is_counted] ** 2))
-    if model in (Model.AFFINE, Model.HOMOGRAPHY):
-        cost += float(np.sum(deviations(poses, problem.unit_from_picture) ** 2 * weights.prior))
+    is_counted = weights > 0
+    cost = float(np.sum(weights[is_counted] * errors[is_counted] ** 2))
+    cost += prior.cost(poses, problem.unit_from_picture)
     return cost if np.isfinite(cost) else float("inf")
 
 
@@ -301,14 +283,14 @@ def _change_of_points(problem: Problem, b_from_a: Doubles) -> tuple[Doubles, Dou
 
 
 def _step(
-    problem: Problem, poses: Doubles, weights: _Weights, model: Model, damping: float
+    problem: Problem, poses: Doubles, weights: Doubles, prior: Prior, model: Model, damping: float
 ) -> Doubles:
     """The change D (n, 8) of every pose that minimises the linearised cost."""
     freedoms = MODEL_BASES[model]
     k, count = freedoms.shape[1], len(poses)
     residuals, by_a, by_b = _jacobians(problem, poses, model)
     links, pairs = problem.counts.shape
-    root = np.sqrt(weights.pairs)
+    root = np.sqrt(weights)
     is_counted = root > 0
     root = np.where(is_counted, root, 0.0)
 
@@ -323,10 +305,12 @@ def _step(
     np.add.at(diagonal, problem.b, jb_t @ jb)
     np.add.at(vector, problem.a, (ja_t @ r)[..., 0])
     np.add.at(vector, problem.b, (jb_t @ r)[..., 0])
-    if model in (Model.AFFINE, Model.HOMOGRAPHY):
-        prior = DEVIATION_ROWS @ freedoms
-        diagonal += prior.T @ (weights.prior[:, None] * prior)
-        vector -= (deviations(poses, problem.unit_from_picture) * weights.prior) @ prior
+    if prior is not NO_PRIOR:
+        unit = problem.unit_from_picture
+        by_d = prior.rows(poses, unit) @ freedoms
+        held = by_d.transpose(0, 2, 1) * prior.precisions
+        diagonal += held @ by_d
+        vector -= (held @ prior.deviations(poses, unit)[..., None])[..., 0]
     if problem.anchor is not None:
         pin = _SIMILARITY_ROWS @ freedoms
         strength = 1e3 * max(1.0, float(np.max(diagonal)))

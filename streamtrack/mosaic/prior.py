@@ -1,11 +1,18 @@
-"""What poses have beyond a similarity, and how near zero a mosaic's adjustment holds it.
+"""What a camera makes of a flat scene, and how an adjustment holds the poses to it.
 
-Links fix only what pictures have in common; the prior fixes what they leave open (see
-`mosaic.adjustment`). Its width is that of the links' own mappings, or of the poses if that is more.
+Links fix only what pictures have in common: any further homography applied to all poses leaves
+every residual as it is, and small errors of the links add up along it. But a camera with square
+pixels that is tilted by an angle stretches the plane along the tilt by the angle's cosine, and
+magnifies it from one side to the other by its tangent over the focal length: of the eight freedoms
+of a homography two are not free (Triggs 1998, "Autocalibration from planar scenes"). So each single
+picture says how the world is tilted, however long the way is that led to it.
+
+How much poses stretch beyond that, and how much they tilt, is learned from the poses themselves.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -13,20 +20,80 @@ import numpy.typing as npt
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
-_FLOOR = 1e-5
-_TILTED = 2.0  # times what noise explains, above which a camera is known to tilt
+USUAL_FOCAL = 2.2
+"""Focal length in halves of the longer side: 49 degrees of view."""
+FOCAL_SIGMA = 0.3
+"""Of its logarithm: 0.74 to 1.35 times the usual."""
+_MAX_FOCAL_STEP = 0.1
+_FIRST_SIGMAS = np.array([1e-3, 5e-2])  # of stretch and of perspective
+_LEAST_SIGMA = 3e-5
+_MAX_LEAST_STRETCH = 1e-3
+_TILT_SHARE = 4.0  # stretch that is not held against tilted poses, times half of what tilt tells
+_STEP = 1e-6
 
-# Rows: how the four measures of `deviations` change with D.
-DEVIATION_ROWS = np.zeros((4, 8))
-DEVIATION_ROWS[0, [0, 4]] = 1.0, -1.0
-DEVIATION_ROWS[1, [1, 3]] = 1.0
-DEVIATION_ROWS[2, 6] = DEVIATION_ROWS[3, 7] = 1.0
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """How firmly poses are held to what a camera can show.
+
+    focal       focal length in units; with 0 perspective tells nothing of stretch
+    precisions  (4,) of the measures of `deviations`
+    """
+
+    focal: float
+    precisions: Doubles
+
+    def deviations(self, poses: Doubles, unit_from_picture: Doubles) -> Doubles:
+        return deviations(poses, unit_from_picture, self.focal)
+
+    def rows(self, poses: Doubles, unit_from_picture: Doubles) -> Doubles:
+        """How the deviations change with D (see `mosaic.bundle`), (n, 4, 8), by differences."""
+        local = poses @ np.linalg.inv(unit_from_picture)
+
+        def changed(step: Doubles) -> Doubles:
+            moved = local @ (np.eye(3) + step) @ unit_from_picture
+            return self.deviations(moved, unit_from_picture)
+
+        steps = _STEP * np.eye(9)[:8].reshape(8, 3, 3)
+        columns = [(changed(step) - changed(-step)) / (2 * _STEP) for step in steps]
+        return np.stack(columns, axis=2)
+
+    def cost(self, poses: Doubles, unit_from_picture: Doubles) -> float:
+        own = self.deviations(poses, unit_from_picture)
+        return float(np.sum(own**2 * self.precisions))
+
+    def learned(self, poses: Doubles, unit_from_picture: Doubles) -> Prior:
+        """With the focal length and the widths that these poses show."""
+        own = self.deviations(poses, unit_from_picture)
+        stretch, bend = _mean_square(own[:, :2]), _mean_square(own[:, 2:]) + _LEAST_SIGMA**2
+        least = min(_MAX_LEAST_STRETCH, _LEAST_SIGMA + _TILT_SHARE * self.focal**2 * bend)
+        focal = self.focal and self._refocused(poses, unit_from_picture, own)
+        return Prior(focal, np.repeat(1 / np.array([stretch + least**2, bend]), 2))
+
+    def _refocused(self, poses: Doubles, unit_from_picture: Doubles, own: Doubles) -> float:
+        """One step of Gauss and Newton on the focal length's logarithm."""
+        longer = deviations(poses, unit_from_picture, self.focal * np.exp(_STEP))
+        change = (longer - own)[:, :2] / _STEP
+        precision, usual = self.precisions[0], FOCAL_SIGMA**-2.0
+        pull = precision * np.sum(change * own[:, :2])
+        pull += usual * np.log(self.focal / USUAL_FOCAL)
+        step = -pull / (precision * np.sum(change**2) + usual)
+        return float(self.focal * np.exp(np.clip(step, -_MAX_FOCAL_STEP, _MAX_FOCAL_STEP)))
 
 
-def deviations(poses: Doubles, unit_from_picture: Doubles) -> Doubles:
-    """What each pose (n, 4) has beyond a similarity: aspect, shear, and perspective along x and y.
+NO_PRIOR = Prior(0.0, np.zeros(4))
 
-    In unit coordinates, at the picture's centre.
+
+def first_prior(focal: float) -> Prior:
+    """Before anything is known: hardly any stretch, and any tilt."""
+    return Prior(focal, np.repeat(_FIRST_SIGMAS**-2.0, 2))
+
+
+def deviations(poses: Doubles, unit_from_picture: Doubles, focal: float) -> Doubles:
+    """What poses (n, 4) have beyond a similarity: two stretches, and perspective along x and y.
+
+    In unit coordinates, at the picture's centre. Of the stretches (aspect and shear) those are
+    taken off that the perspective tells of with this focal length.
     """
     local = poses @ np.linalg.inv(unit_from_picture)
     corner = local[:, 2, 2]
@@ -34,38 +101,15 @@ def deviations(poses: Doubles, unit_from_picture: Doubles) -> Doubles:
     linear = linear - local[:, :2, 2:] * local[:, 2:, :2] / corner[:, None, None] ** 2
     metric = linear.transpose(0, 2, 1) @ linear
     trace = metric[:, 0, 0] + metric[:, 1, 1]
-    aspect = (metric[:, 0, 0] - metric[:, 1, 1]) / trace
-    shear = 2 * metric[:, 0, 1] / trace
     bend = local[:, 2, :2] / corner[:, None]
+    x, y = focal * bend.T
+    tilted = 2 + x * x + y * y
+    aspect = (metric[:, 0, 0] - metric[:, 1, 1]) / trace - (x * x - y * y) / tilted
+    shear = 2 * metric[:, 0, 1] / trace - 2 * x * y / tilted
     return np.stack([aspect, shear, bend[:, 0], bend[:, 1]], axis=1)
 
 
-def prior_precisions(of_poses: Doubles, of_links: Doubles, noise_variances: Doubles) -> Doubles:
-    """Precisions (4,) with which the poses' deviations are held at zero.
-
-    ``of_poses`` (n, 4) and ``of_links`` (L, 4) are the deviations of poses and of the links' own
-    mappings, ``noise_variances`` (4,) what noise explains of the latter.
-
-    Poses that are linked and deviate alike, as those of a camera that tilts slowly, are not as
-    many witnesses of where zero is: of a first-order process with variance v whose neighbours
-    differ by d in the mean square, n count as n d / (4 v - d) (Bayley & Hammersley 1946). Else a
-    long way without a loop is bent for the sake of a mean that it cannot know. Where the links
-    themselves deviate by no more than their noise, nothing tilts, and all of them count.
-    """
-    absolute, relative = _variances(of_poses), _variances(of_links)
-    is_slow = (relative < 2 * absolute) & (relative > _TILTED * noise_variances)
-    witnesses = np.where(is_slow, relative / (4 * absolute - relative), 1.0)
-    precisions: Doubles = witnesses / np.maximum(absolute, relative)
-    return precisions
-
-
-def _variances(of_pictures: Doubles) -> Doubles:
-    """Mean squares (4,) of deviations (n, 4), the farthest tenth left out."""
-    squares = of_pictures**2
-    kept = np.sort(squares, axis=0)[: max(1, round(0.9 * len(squares)))]
-    return of_each_kind(kept.mean(axis=0)) + _FLOOR**2
-
-
-def of_each_kind(values: Doubles) -> Doubles:
-    """One value (4,) for both measures of a kind: a camera turned by 90 degrees is no other."""
-    return np.repeat([np.mean(values[:2]), np.mean(values[2:])], 2)
+def _mean_square(values: Doubles) -> float:
+    """Of a coordinate of values (n, 2), the farthest tenth left out."""
+    squares = np.sort(np.sum(values**2, axis=1)) / 2
+    return float(np.mean(squares[: max(1, round(0.9 * len(squares)))]))

@@ -5,7 +5,6 @@ Unknown names are refused. All settings are frozen: a run has one set from start
 
 from __future__ import annotations
 
-import tomllib
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal, Self, TypeAlias, get_args
@@ -246,6 +245,8 @@ def _setting_names() -> list[str]:
 
 def read_settings_file(path: Path) -> dict[str, Any]:
     """Nested values of a TOML settings file. Raises UsageError if it cannot be read."""
+    import tomllib
+
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

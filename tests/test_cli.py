@@ -333,7 +333,7 @@ import os, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # not ignored, as in a shell's background
 class Interrupting:
     def find_spec(self, name, *_):
-        if name == "streamtrack.cli.mosaic":
+        if name == "streamtrack.cli.process":
             os.kill(os.getpid(), signal.SIGINT)
 sys.meta_path.insert(0, Interrupting())
 from streamtrack.__main__ import main

@@ -9,6 +9,8 @@ import sys
 import tomllib
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 import streamtrack
@@ -57,6 +59,44 @@ def test_heavy_modules_are_imported_where_they_are_used(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert result.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "banned"),
+    [
+        (("--help",), ("numpy", "cv2", "pydantic", "rich", "streamtrack.settings")),
+        (("mosaic", "--help"), ("numpy", "cv2", "streamtrack.cli.track", "streamtrack.cli.bench")),
+        (
+            ("mosaic", "a.png", "b.png", "-o", "m.png"),
+            (
+                *("av", "rerun", "pyarrow", "rich", "scipy", "tomllib"),
+                *("streamtrack.cli.track", "streamtrack.cli.bench", "streamtrack.cli.devices"),
+                *("streamtrack.mosaic.stream", "streamtrack.mosaic.adjustment"),
+                *("streamtrack.mosaic.pictures.rotation", "streamtrack.pipeline"),
+            ),
+        ),
+    ],
+)
+def test_a_command_loads_nothing_that_it_does_not_use(
+    arguments: tuple[str, ...], banned: tuple[str, ...], tmp_path: Path
+) -> None:
+    picture = np.random.default_rng(1).integers(0, 256, (120, 160), np.uint8)
+    picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 2.0), np.uint8)
+    for name, part in (("a.png", picture[:, :120]), ("b.png", picture[:, 30:])):
+        cv2.imwrite(str(tmp_path / name), cv2.normalize(part, None, 0, 255, cv2.NORM_MINMAX))
+    code = f"""
+import sys
+from streamtrack.__main__ import main
+sys.argv[1:] = {arguments!r}
+try:
+    main()
+finally:
+    print([m for m in {banned!r} if m in sys.modules])
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=True
+    )
+    assert ended.stdout.splitlines()[-1] == "[]"
 
 
 def test_all_that_is_imported_is_installed_with_the_package() -> None:

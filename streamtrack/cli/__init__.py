@@ -1,6 +1,7 @@
 """The command line, one file a command; the only package that talks to Typer.
 
-Heavy modules are imported where they are used, so that --help is instant.
+Commands are loaded when they are called, and heavy modules where they are used, so that --help is
+instant and no command pays for another.
 """
 
 from __future__ import annotations
@@ -9,24 +10,28 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterable
+from importlib import import_module
 from typing import Annotated, Any
 
 import typer
 
-from streamtrack.cli.bench import bench_app
-from streamtrack.cli.devices import devices
-from streamtrack.cli.mosaic import mosaic
 from streamtrack.cli.process import hide_secrets
-from streamtrack.cli.tools import synth, view
-from streamtrack.cli.track import track
 from streamtrack.errors import StreamtrackError, UsageError
 
 _TYPER_INTERRUPTED = 130  # what Typer returns for a Ctrl-C, without a word
 _LIVE_ADDRESS = re.compile(r"(\S*:)?\d+")
 
-__all__ = ["app", "exit_on_error", "main", "with_live_address"]
+__all__ = ["exit_on_error", "main", "with_live_address"]
 
-_COMMANDS: tuple[Callable[..., None], ...] = (track, mosaic, devices, synth, view)
+_HOMES = {
+    "track": "track",
+    "mosaic": "mosaic",
+    "devices": "devices",
+    "synth": "tools",
+    "view": "tools",
+    "bench": "bench",
+}
+"""The module of each command, in the order of the help."""
 
 
 def _version(wanted: bool) -> None:
@@ -45,8 +50,8 @@ def _common(
     """Track objects in video, build mosaics of what the camera saw; see why in Rerun."""
 
 
-def _program(commands: Iterable[Callable[..., None]]) -> typer.Typer:
-    """The program with these commands and ``bench``."""
+def _program(commands: Iterable[str]) -> typer.Typer:
+    """The program with these commands."""
     program = typer.Typer(
         name="streamtrack",
         help="Track objects in video, build mosaics of what the camera saw; see why in Rerun.",
@@ -56,13 +61,13 @@ def _program(commands: Iterable[Callable[..., None]]) -> typer.Typer:
         rich_markup_mode=None,
     )
     program.callback()(_common)
-    for command in commands:
-        program.command()(command)
-    program.add_typer(bench_app, name="bench")
+    for name in commands:
+        command = getattr(import_module(f"streamtrack.cli.{_HOMES[name]}"), name)
+        if isinstance(command, typer.Typer):
+            program.add_typer(command, name=name)
+        else:
+            program.command()(command)
     return program
-
-
-app = _program(_COMMANDS)
 
 
 def main() -> None:
@@ -77,9 +82,9 @@ def main() -> None:
     # Nothing plugs into pydantic here, and looking for it reads every installed package's metadata.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     # Where one command is called, Typer need not work out the options of all the others.
-    called = [command for command in _COMMANDS if [command.__name__] == sys.argv[1:2]]
-    program = _program(called) if called else app
-    exit_on_error(lambda: program(with_live_address(sys.argv[1:]), standalone_mode=False))
+    called = [name for name in _HOMES if [name] == sys.argv[1:2]]
+    arguments = with_live_address(sys.argv[1:])
+    exit_on_error(lambda: _program(called or _HOMES)(arguments, standalone_mode=False))
 
 
 def with_live_address(arguments: list[str]) -> list[str]:

@@ -9,14 +9,14 @@ import typer
 
 from streamtrack.cli.common import StopOnSignal, consoles, warnings_shown
 
-bench_app = typer.Typer(
+bench = typer.Typer(
     help="Measure accuracy and cost on sequences with known truth, against peers.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
 
 
-@bench_app.command("track")
+@bench.command("track")
 def bench_track(
     quick: Annotated[
         bool,
@@ -69,7 +69,7 @@ def bench_track(
         run_request(request, console, (lambda _line: None) if quiet else tell_on(errors), stop)
 
 
-@bench_app.command("mosaic")
+@bench.command("mosaic")
 def bench_mosaic(
     pairs: Annotated[
         Path | None,

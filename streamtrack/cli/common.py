@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import signal
 import sys
@@ -135,7 +136,7 @@ def print_summary(console: Console, rows: list[tuple[str, str]], record: Path | 
 
 
 class StopOnSignal:
-    """True once SIGINT or SIGTERM came: the run ends after the frame it is at.
+    """The work of a command. True once SIGINT or SIGTERM came: it ends after the frame it is at.
 
     A second signal interrupts at once, for a run that hangs.
     """
@@ -150,6 +151,8 @@ class StopOnSignal:
     def __enter__(self) -> StopOnSignal:
         for number in (signal.SIGINT, signal.SIGTERM):
             self._before[number] = signal.signal(number, self._stop)
+        gc.freeze()  # what is loaded by now stays: garbage is looked for among the rest
+        gc.enable()
         return self
 
     def __exit__(self, *exc: object) -> None:

@@ -1,6 +1,8 @@
-"""`streamtrack mosaic`."""
+"""`streamtrack mosaic`.
 
-from __future__ import annotations
+Its annotations are no strings (`from __future__ import annotations`): Typer would evaluate each of
+them three times.
+"""
 
 import sys
 from pathlib import Path
@@ -147,7 +149,7 @@ def _settings(
     model: str | None,
     mosaic_flags: dict[str, str | float | None],
     live_flags: dict[str, float | int | None],
-) -> Settings:
+) -> "Settings":
     names = ("detector", "threshold", "descriptor")
     return merged_settings(
         path,

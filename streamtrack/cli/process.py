@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +20,8 @@ def hide_secrets(arguments: Sequence[str]) -> None:
     found = {secret for text in arguments if "://" in text for secret in secrets_of(text)}
     if not found or not sys.platform.startswith("linux"):
         return
+    import ctypes
+
     with contextlib.suppress(OSError, ValueError, IndexError):
         fields = Path("/proc/self/stat").read_text("ascii", errors="replace")
         # The second field, the program's name, may hold anything.

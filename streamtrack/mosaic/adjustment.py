@@ -9,7 +9,7 @@ poses are held to what a camera with square pixels can show of a plane (`mosaic.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import log
 from typing import Literal
 
@@ -27,38 +27,14 @@ from streamtrack.mosaic.bundle import (
     solve,
     transfer_errors_of,
 )
-from streamtrack.mosaic.types import Link
-from streamtrack.types import Mask, Matrix, Model, Size
+from streamtrack.mosaic.types import Adjusted, Link
+from streamtrack.types import Matrix, Model, Size
 
 _CELLS = 4  # along each side of the box around a link's points: their pairs are averaged
 _MAX_CELL_PAIRS = 40.0  # more in one cell count no more
 _LADDER = (Model.SIMILARITY, Model.AFFINE, Model.HOMOGRAPHY)
 _NEAR_ROUNDS = 12
 _GAIN_OF_FREEDOM = 0.02  # share of the noise that a richer model must take away
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Adjusted:
-    """Poses after adjustment, and how well the links agree with them.
-
-    world_from_picture  the pictures that used links connect with the anchor (or a fixed picture)
-    model               the model of the poses
-    rmse_px             of the used links, each counting the same, in picture pixels, or NaN
-    link_rmse_px        float64 (L,), error of each link's own inlier pairs, NaN if not measured
-    is_used             bool (L,), False for links that were refused before, or reject here
-    """
-
-    world_from_picture: dict[int, Matrix]
-    model: Model
-    rmse_px: float
-    link_rmse_px: Doubles
-    is_used: Mask
-
-    @property
-    def rejected(self) -> tuple[int, ...]:
-        """Rows of the measured links that disagree with the others."""
-        wrong = np.flatnonzero(~self.is_used & np.isfinite(self.link_rmse_px))
-        return tuple(int(row) for row in wrong)
 
 
 def adjust(

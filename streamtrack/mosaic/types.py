@@ -6,13 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.pose_graph import KeyframeEdge
 from streamtrack.pyramid import Pyramid
 from streamtrack.types import (
     Features,
     Image,
+    Mask,
     Matches,
     Matrix,
     Model,
@@ -21,6 +25,9 @@ from streamtrack.types import (
     Size,
     Verdict,
 )
+
+if TYPE_CHECKING:
+    from streamtrack.pose_graph import KeyframeEdge
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +85,30 @@ class Link:
     @property
     def verdict(self) -> Verdict:
         return self.registration.verdict
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjusted:
+    """Poses after adjustment, and how well the links agree with them.
+
+    world_from_picture  the pictures that used links connect with the anchor (or a fixed picture)
+    model               the model of the poses
+    rmse_px             of the used links, each counting the same, in picture pixels, or NaN
+    link_rmse_px        float64 (L,), error of each link's own inlier pairs, NaN if not measured
+    is_used             bool (L,), False for links that were refused before, or reject here
+    """
+
+    world_from_picture: dict[int, Matrix]
+    model: Model
+    rmse_px: float
+    link_rmse_px: npt.NDArray[np.float64]
+    is_used: Mask
+
+    @property
+    def rejected(self) -> tuple[int, ...]:
+        """Rows of the measured links that disagree with the others."""
+        wrong = np.flatnonzero(~self.is_used & np.isfinite(self.link_rmse_px))
+        return tuple(int(row) for row in wrong)
 
 
 class Status(StrEnum):

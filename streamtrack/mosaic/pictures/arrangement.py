@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from streamtrack import geometry
 from streamtrack.errors import StreamtrackError
-from streamtrack.mosaic.adjustment import Adjusted, adjust
 from streamtrack.mosaic.pictures.graph import (
     Part,
     contradicted_links,
@@ -32,10 +31,12 @@ from streamtrack.mosaic.pictures.projection import (
     planar_views,
     turned_views,
 )
-from streamtrack.mosaic.pictures.rotation import Rotations, adjust_rotations
-from streamtrack.mosaic.types import Link
+from streamtrack.mosaic.types import Adjusted, Link
 from streamtrack.settings import Settings
 from streamtrack.types import Matrix, Model, Size
+
+if TYPE_CHECKING:
+    from streamtrack.mosaic.pictures.rotation import Rotations
 
 _MAX_MAGNIFICATION = 15.0
 _MAX_VIEW_AREA = 12.0  # of a picture's box on a plane, per area that its middle's scale gives it
@@ -142,6 +143,8 @@ def _turning(
     """Rotations of all pictures of a part, without links they contradict; None if unfit."""
     if settings.registration.model not in ("auto", "homography"):
         return None
+    from streamtrack.mosaic.pictures.rotation import adjust_rotations
+
     used = list(links)
     for _ in range(3):
         found = adjust_rotations(used, sizes, part.centre)
@@ -196,6 +199,8 @@ def _turned(
 def _plane(
     links: Sequence[Link], sizes: Mapping[int, Size], part: Part, settings: Settings
 ) -> Adjusted | None:
+    from streamtrack.mosaic.adjustment import adjust
+
     rough = tree_poses(part.centre, links)
     chosen = settings.registration.model
     model: Model | Literal["auto"] = "auto" if chosen == "auto" else Model(chosen)

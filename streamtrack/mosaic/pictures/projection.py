@@ -12,14 +12,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.mosaic.pictures.rotation import Rotations
 from streamtrack.types import Matrix, Size
+
+if TYPE_CHECKING:
+    from streamtrack.mosaic.pictures.rotation import Rotations
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 Kind: TypeAlias = Literal["planar", "cylindrical", "spherical"]

@@ -49,14 +49,11 @@ class Prior:
     def rows(self, poses: Doubles, unit_from_picture: Doubles) -> Doubles:
         """How the deviations change with D (see `mosaic.bundle`), (n, 4, 8), by differences."""
         local = poses @ np.linalg.inv(unit_from_picture)
-
-        def changed(step: Doubles) -> Doubles:
-            moved = local @ (np.eye(3) + step) @ unit_from_picture
-            return self.deviations(moved, unit_from_picture)
-
-        steps = _STEP * np.eye(9)[:8].reshape(8, 3, 3)
-        columns = [(changed(step) - changed(-step)) / (2 * _STEP) for step in steps]
-        return np.stack(columns, axis=2)
+        steps = _STEP * np.eye(9)[:8].reshape(8, 1, 3, 3)
+        ahead, behind = (
+            _local_deviations(local @ (np.eye(3) + s), self.focal) for s in (steps, -steps)
+        )
+        return np.moveaxis((ahead - behind) / (2 * _STEP), 0, 2)
 
     def cost(self, poses: Doubles, unit_from_picture: Doubles) -> float:
         own = self.deviations(poses, unit_from_picture)
@@ -95,18 +92,21 @@ def deviations(poses: Doubles, unit_from_picture: Doubles, focal: float) -> Doub
     In unit coordinates, at the picture's centre. Of the stretches (aspect and shear) those are
     taken off that the perspective tells of with this focal length.
     """
-    local = poses @ np.linalg.inv(unit_from_picture)
-    corner = local[:, 2, 2]
-    linear = local[:, :2, :2] / corner[:, None, None]
-    linear = linear - local[:, :2, 2:] * local[:, 2:, :2] / corner[:, None, None] ** 2
-    metric = linear.transpose(0, 2, 1) @ linear
-    trace = metric[:, 0, 0] + metric[:, 1, 1]
-    bend = local[:, 2, :2] / corner[:, None]
-    x, y = focal * bend.T
+    return _local_deviations(poses @ np.linalg.inv(unit_from_picture), focal)
+
+
+def _local_deviations(local: Doubles, focal: float) -> Doubles:
+    """The same (..., 4) of poses (..., 3, 3) from unit coordinates."""
+    local = local / local[..., 2:, 2:]
+    first, second = np.moveaxis(local[..., :2, :2] - local[..., :2, 2:] * local[..., 2:, :2], -1, 0)
+    first_square, second_square = np.sum(first**2, axis=-1), np.sum(second**2, axis=-1)
+    trace = first_square + second_square
+    bend_x, bend_y = np.moveaxis(local[..., 2, :2], -1, 0)
+    x, y = focal * bend_x, focal * bend_y
     tilted = 2 + x * x + y * y
-    aspect = (metric[:, 0, 0] - metric[:, 1, 1]) / trace - (x * x - y * y) / tilted
-    shear = 2 * metric[:, 0, 1] / trace - 2 * x * y / tilted
-    return np.stack([aspect, shear, bend[:, 0], bend[:, 1]], axis=1)
+    aspect = (first_square - second_square) / trace - (x * x - y * y) / tilted
+    shear = 2 * np.sum(first * second, axis=-1) / trace - 2 * x * y / tilted
+    return np.stack([aspect, shear, bend_x, bend_y], axis=-1)
 
 
 def _mean_square(values: Doubles) -> float:

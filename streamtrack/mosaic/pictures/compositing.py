@@ -7,7 +7,7 @@ are warped one after the other and added up, so that memory does not grow with t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
@@ -189,12 +189,14 @@ def _painted(
     advance: Callable[[], None],
 ) -> Image:
     size = planned.canvas.size_wh[0], band[1] - band[0]
-    zone = _zone(planned, band, _REACH * 2 ** _levels(planned.canvas))
+    boxes = [
+        _reached(planned, row, settings.blending) for row in range(len(planned.canvas.patches))
+    ]
+    zone = _zone(boxes, (0, band[0], size[0], band[1]), _REACH * 2 ** _levels(planned.canvas))
     blend = _BLENDS[settings.blending](size, planned.canvas, zone)
     for row, patch in enumerate(planned.canvas.patches):
-        x0, y0, x1, y1 = patch.box
-        box = x0, max(y0, band[0]), x1, min(y1, band[1])
-        if box[1] >= box[3]:
+        box = _common(boxes[row], (0, band[0], size[0], band[1]))
+        if box[0] >= box[2] or box[1] >= box[3]:
             continue
         warped, cover = warp(
             read(patch.picture),
@@ -345,22 +347,39 @@ def _common(a: Box, b: Box) -> Box:
     return max(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), min(a[3], b[3])
 
 
-def _zone(planned: Plan, band: tuple[int, int], margin: int) -> Box:
+def _reached(planned: Plan, row: int, blending: Blending) -> Box:
+    """The part of a patch's box in which the mosaic is its, or blending reaches that; or none."""
+    box = planned.canvas.patches[row].box
+    if planned.seams is None:
+        return box
+    x, y, width, height = cv2.boundingRect(planned.seams[row])
+    if not width:
+        return 0, 0, 0, 0
+    small_box, small_size = planned.small.patches[row].box, planned.small.size_wh
+    x_factor, y_factor = np.array(planned.canvas.size_wh) / small_size
+    # The small mask grows by a pixel, and its own pixels lie half a pixel off.
+    margin = _margin(planned.canvas, blending) + 2 * max(x_factor, y_factor)
+    x0, y0 = x + small_box[0], y + small_box[1]
+    reached = (
+        int(x0 * x_factor - margin),
+        int(y0 * y_factor - margin),
+        int((x0 + width) * x_factor + margin) + 1,
+        int((y0 + height) * y_factor + margin) + 1,
+    )
+    return _common(box, reached)
+
+
+def _zone(reached: Sequence[Box], band: Box, margin: int) -> Box:
     """The box within a band, its first row 0, that holds all overlaps and what blends into them."""
-    width = planned.canvas.size_wh[0]
-    boxes = [
-        _common(a.box, b.box)
-        for i, a in enumerate(planned.canvas.patches)
-        for b in planned.canvas.patches[:i]
-    ]
+    boxes = [_common(a, b) for i, a in enumerate(reached) for b in reached[:i]]
     real = [box for box in boxes if box[0] < box[2] and box[1] < box[3]]
     if not real:
         return 0, 0, 0, 0
     corners = np.array(real)
     x0, y0 = (int(v) - margin for v in corners[:, :2].min(axis=0))
     x1, y1 = (int(v) + margin for v in corners[:, 2:].max(axis=0))
-    box = _common((x0, y0, x1, y1), (0, band[0], width, band[1]))
-    return box[0], box[1] - band[0], box[2], box[3] - band[0]
+    box = _common((x0, y0, x1, y1), band)
+    return box[0], box[1] - band[1], box[2], box[3] - band[1]
 
 
 def _part(canvas: npt.NDArray[_T], patch: Image, corner: tuple[int, int]) -> npt.NDArray[_T]:

@@ -11,10 +11,11 @@ import numpy.typing as npt
 from streamtrack.fitting import median
 from streamtrack.mosaic.gains import GainEdge, solve_gains
 from streamtrack.mosaic.pictures.seams import SmallPatch
+from streamtrack.types import Image, Mask
 
 _MIN_OVERLAP_PX = 60
 _ENOUGH_PX = 8000  # every other pixel of a larger overlap tells as much
-_DARK, _BRIGHT = 8, 247
+_DARKEST, _BRIGHTEST = (9, 9, 9), (246, 246, 246)  # beyond, brightness is cut off
 Doubles = npt.NDArray[np.float64]
 
 
@@ -33,9 +34,7 @@ def compensation_gains(
             continue
         if both.size > _ENOUGH_PX:
             image_a, image_b, both = image_a[::2, ::2], image_b[::2, ::2], both[::2, ::2]
-        low = np.minimum(image_a, image_b).min(axis=2)
-        high = np.maximum(image_a, image_b).max(axis=2)
-        fit = both & (low > _DARK) & (high < _BRIGHT)
+        fit = both & _is_exposed(image_a) & _is_exposed(image_b)
         count = int(np.count_nonzero(fit))
         if count < _MIN_OVERLAP_PX:
             continue
@@ -48,6 +47,11 @@ def compensation_gains(
     # Only relations are known: overall, the mosaic stays as bright as its pictures.
     factors = np.exp(logs - logs.mean(axis=0))
     return {picture: factors[i] for picture, i in row.items()}
+
+
+def _is_exposed(image: Image) -> Mask:
+    """Where (h, w) no colour of BGR (h, w, 3) is black or white."""
+    return np.asarray(cv2.inRange(image, _DARKEST, _BRIGHTEST) > 0, np.bool_)
 
 
 def overlap_ncc(patches: Sequence[SmallPatch]) -> float:

@@ -53,9 +53,9 @@ def seam_masks(patches: Sequence[SmallPatch], size_wh: Size) -> list[Image]:
         is_new = _won(
             patch, own_weight, seen[there], weight[there], np.asarray(owner[there] >= 0, np.bool_)
         )
-        owner[there][is_new] = row
-        weight[there][is_new] = own_weight[is_new]
-        seen[there][is_new] = patch.image[is_new]
+        np.copyto(owner[there], row, where=is_new)
+        np.copyto(weight[there], own_weight, where=is_new)
+        cv2.copyTo(patch.image, is_new.astype(np.uint8), seen[there])
     return [
         np.asarray(owner[p.box[1] : p.box[3], p.box[0] : p.box[2]] == row, np.uint8) * np.uint8(255)
         for row, p in enumerate(patches)
@@ -96,7 +96,8 @@ def _won(
     new = np.asarray(won | (overlap & (lead > reach)), np.uint8) * np.uint8(255)
     free = np.asarray(overlap & (np.abs(lead) <= reach), np.uint8) * np.uint8(255)
     if old.any() and new.any():
-        cost = np.asarray(cv2.blur(cv2.absdiff(patch.image, seen).max(axis=2), (3, 3)), np.uint8)
+        blue, green, red = cv2.split(cv2.absdiff(patch.image, seen))
+        cost = np.asarray(cv2.blur(cv2.max(cv2.max(blue, green), red), (3, 3)), np.uint8)
         _give_away_things(cost, lead, old, new, free)
         new, free = _flooded(cost, old, new, free)
     return np.asarray((new > 0) | ((free > 0) & (lead > 0)), np.bool_)
@@ -122,9 +123,11 @@ def _give_away_things(
             continue
         contact = int(touches_new[label]) - int(touches_old[label])
         is_new = contact > 0 or (contact == 0 and leads[label] > 0)
-        own = labels == label
-        (new if is_new else old)[own] = 255
-        free[own] = 0
+        x0, y0, width, height = stats[label, :4].tolist()
+        part = slice(y0, y0 + height), slice(x0, x0 + width)
+        own = labels[part] == label
+        np.copyto((new if is_new else old)[part], 255, where=own)
+        np.copyto(free[part], 0, where=own)
 
 
 def _flooded(cost: Image, old: Image, new: Image, free: Image) -> tuple[Image, Image]:
@@ -141,11 +144,14 @@ def _flooded(cost: Image, old: Image, new: Image, free: Image) -> tuple[Image, I
         high = np.asarray(cost >= level, np.uint8) * np.uint8(255)
         allowed = cv2.bitwise_and(left, high)
         for _ in range(_STEPS):
+            if not cv2.countNonZero(allowed):
+                break
             for side in (old, grown):
                 step = cv2.bitwise_and(cv2.dilate(side, _CROSS), allowed)
                 cv2.bitwise_or(side, step, dst=side)
                 cv2.subtract(allowed, step, dst=allowed)
-                cv2.subtract(left, step, dst=left)
+        for side in (old, grown):
+            cv2.subtract(left, side, dst=left)
     new, free = new.copy(), free.copy()
     new[part], free[part] = grown, left
     return new, free

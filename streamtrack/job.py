@@ -28,6 +28,7 @@ from streamtrack.summary import Summary, SummaryBuilder
 from streamtrack.targets import TargetSpec, given_targets
 from streamtrack.types import Skipped, SourceInfo, Step
 from streamtrack.watching import Outputs, RunSummary, Watchers, live_source, open_watchers
+from streamtrack.working_size import graph_in_full_size
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +95,12 @@ def run_track(
     Raises StreamtrackError if it cannot even start, or an output cannot be closed.
     """
 
-    def begin_report(source: FrameSource, _camera: object, _watchers: object) -> SummaryBuilder:
-        return SummaryBuilder(source.info, job.settings)
+    def begin_report(
+        source: FrameSource, camera: CameraEstimator, _watchers: object
+    ) -> SummaryBuilder:
+        info, settings = source.info, job.settings
+        graph = graph_in_full_size(camera.graph, info.size_wh, settings.max_width)
+        return SummaryBuilder(info, settings, graph=graph)
 
     return run(job, begin_report, progress, should_stop)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from math import isfinite
 from typing import Protocol
 
 from streamtrack.types import Matrix
@@ -18,6 +19,36 @@ class KeyframeEdge:
     inliers: int
     rmse_px: float
     is_loop: bool
+
+
+class _Drifting(Protocol):
+    @property
+    def keyframes(self) -> Mapping[int, object]: ...
+
+    def sigma_px(self, index: int) -> float: ...
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedDrift:
+    """Expected RMS errors of corners in world pixels: of the last keyframe, and the largest."""
+
+    end_px: float
+    most_px: float
+
+    @classmethod
+    def of(cls, graph: _Drifting | None) -> ExpectedDrift | None:
+        """None without keyframes, or as long as nothing is known of them."""
+        if graph is None:
+            return None
+        sigmas = [graph.sigma_px(index) for index in graph.keyframes]
+        known = [sigma for sigma in sigmas if isfinite(sigma)]
+        return cls(known[-1], max(known)) if known else None
+
+    def to_json(self) -> dict[str, float]:
+        return {"end": round(self.end_px, 3), "most": round(self.most_px, 3)}
+
+    def to_text(self) -> str:
+        return f"expected drift {self.end_px:.2g} px at the end, {self.most_px:.2g} px at most"
 
 
 class Keyframe(Protocol):
@@ -41,6 +72,10 @@ class PoseGraph(Protocol):
 
     def world_from_frame(self, index: int) -> Matrix | None:
         """The pose of a frame as it is known now."""
+        ...
+
+    def sigma_px(self, index: int) -> float:
+        """Expected RMS error of a frame's corners in the world, NaN if not known."""
         ...
 
     def keep(self, index: int) -> None:

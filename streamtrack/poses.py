@@ -13,6 +13,7 @@ from streamtrack.types import Matrix, Skipped
 _COLUMNS = (
     *("frame", "name", "time_s", "status", "reason"),
     *(f"h{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)),
+    "world_sigma_px",
 )
 _GIVEN_UP = "its pose was given up later"
 
@@ -20,26 +21,35 @@ _GIVEN_UP = "its pose was given up later"
 class PosesWriter(RecordFile):
     """CSV of camera poses: ``world_from_frame`` row by row, in full precision.
 
-    Status is ``used``, or ``skipped`` with a reason and no matrix where the pose is not known.
+    ``world_sigma_px`` is the expected RMS error of the frame's corners in the world, empty where
+    it is not known. Status is ``used``, or ``skipped`` with a reason and no matrix where the pose
+    is not known.
     """
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, csv_line(_COLUMNS))
 
     def write_pose(
-        self, index: int, name: str, time_s: float, world_from_frame: Matrix | None, reason: str
+        self,
+        index: int,
+        name: str,
+        time_s: float,
+        world_from_frame: Matrix | None,
+        reason: str,
+        sigma_px: float = math.nan,
     ) -> None:
         """Add a frame's pose, or why it has none. Raises OutputError."""
         time_cell = f"{time_s:.6f}" if math.isfinite(time_s) else ""
         if world_from_frame is None:
-            self._add(index, name, time_cell, "skipped", reason, [""] * 9)
+            self._add(index, name, time_cell, "skipped", reason, [""] * 10)
         else:
             elements = [str(float(value)) for value in world_from_frame.ravel()]
+            elements.append(f"{sigma_px:.3f}" if math.isfinite(sigma_px) else "")
             self._add(index, name, time_cell, "used", "", elements)
 
     def write_skipped(self, skipped: Skipped) -> None:
         """Add a picture that the source left out; its time is not known. Raises OutputError."""
-        self._add(skipped.index, skipped.name, "", "skipped", skipped.reason, [""] * 9)
+        self._add(skipped.index, skipped.name, "", "skipped", skipped.reason, [""] * 10)
 
     def _add(
         self, index: int, name: str, time_s: str, status: str, reason: str, elements: list[str]
@@ -50,6 +60,8 @@ class PosesWriter(RecordFile):
 
 class _Poses(Protocol):
     def world_from_frame(self, index: int) -> Matrix | None: ...
+
+    def sigma_px(self, index: int) -> float: ...
 
 
 class FinalPoses:
@@ -63,7 +75,13 @@ class FinalPoses:
         self._numbers = {"": 0}
 
     def add(
-        self, index: int, name: str, time_s: float, world_from_frame: Matrix | None, reason: str
+        self,
+        index: int,
+        name: str,
+        time_s: float,
+        world_from_frame: Matrix | None,
+        reason: str,
+        _sigma_px: float = math.nan,
     ) -> None:
         """Note a frame, as `PosesWriter.write_pose` would write it."""
         if world_from_frame is None and not reason:
@@ -81,4 +99,5 @@ class FinalPoses:
             reason = reasons[number]
             pose = None if reason else self._poses.world_from_frame(index)
             reason = reason or ("" if pose is not None else _GIVEN_UP)
-            self._writer.write_pose(index, self._names.get(index, ""), time_s, pose, reason)
+            name, sigma_px = self._names.get(index, ""), self._poses.sigma_px(index)
+            self._writer.write_pose(index, name, time_s, pose, reason, sigma_px)

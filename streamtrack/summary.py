@@ -11,6 +11,8 @@ inliers, transformation model. Definitions:
                    ``frames_over`` those that took longer, waiting for their turn included
     automatic      targets found by their motion; ``most_at_once`` of them tracked in one frame;
                    of more than 1000 those seen last are listed
+    expected_drift_px   expected RMS errors of the pictures' corners in the world, in pixels of the
+                   first frame: of the last keyframe, and the largest (`mosaic.drift`)
     losses         changes from tracking to lost
     ms_per_frame   wall time of a frame, its stages together; quantiles are nearest-rank, from
                    bins 1 % wide, so right to 0.5 %; ``by_stage`` is the mean over all frames
@@ -31,6 +33,7 @@ from typing import Any
 from streamtrack.budget import LEVELS
 from streamtrack.camera.notes import CameraNotes
 from streamtrack.meters import LogHistogram, Mean, nearest_rank, peak_rss_mb
+from streamtrack.pose_graph import ExpectedDrift, PoseGraph
 from streamtrack.settings import Settings
 from streamtrack.sources.live_status import LiveStatus
 from streamtrack.summary_text import cell, markdown, number, write_json
@@ -66,6 +69,7 @@ class Summary:
     ended: str
     live: LiveStatus | None = None
     camera_notes: tuple[str, ...] = ()
+    expected_drift: ExpectedDrift | None = None
     auto_at_once: int | None = None
     auto_count: int = 0
 
@@ -107,6 +111,7 @@ class Summary:
             "camera": self.settings.camera,
             "camera_notes": list(self.camera_notes),
             "frames_with_pose": self.frames_with_pose,
+            "expected_drift_px": self.expected_drift and self.expected_drift.to_json(),
             "features": self.features,
             "matches": {"mean": self.matches, "median": self.matches_median},
             "inliers": self.inliers,
@@ -139,7 +144,8 @@ class Summary:
         camera = f"{self.settings.camera}, known in {self.frames_with_pose} frames"
         if self.settings.camera == "fixed":
             camera = "fixed" if self.camera_notes else "fixed (checked)"
-        camera = "; ".join((camera, *self.camera_notes))
+        drift = () if self.expected_drift is None else (self.expected_drift.to_text(),)
+        camera = "; ".join((camera, *self.camera_notes, *drift))
         ms = f"median {number(self.ms_median, 1)} ms, p95 {number(self.ms_p95, 1)} ms"
         return [
             ("Source", f"{self.source}, {self.size_wh[0]}x{self.size_wh[1]}"),
@@ -227,7 +233,8 @@ class Summary:
 class SummaryBuilder:
     """Running sums over Steps; memory does not grow with the number of frames.
 
-    ``clock`` gives wall seconds. Targets may appear at any time.
+    ``clock`` gives wall seconds, ``graph`` the keyframes of a moving camera. Targets
+    may appear at any time.
     """
 
     def __init__(
@@ -235,9 +242,11 @@ class SummaryBuilder:
         source: SourceInfo,
         settings: Settings,
         clock: Callable[[], float] = time.perf_counter,
+        graph: PoseGraph | None = None,
     ) -> None:
         self._source = source
         self._settings = settings
+        self._graph = graph
         self._clock = clock
         self._started = clock()
         self._frames = 0
@@ -337,6 +346,7 @@ class SummaryBuilder:
             ended=ended,
             live=live,
             camera_notes=self._camera.all(),
+            expected_drift=ExpectedDrift.of(self._graph),
             auto_at_once=self._auto_at_once,
             auto_count=self._auto_count,
         )

@@ -368,7 +368,9 @@ class CameraPose:
 
     ``matches`` and ``inliers`` count the places that were compared and that agree. ``keyframe`` is
     the index of the keyframe that the frame was measured against, the frame's own if it became
-    one. ``warning`` says what is wrong although the pose is given: a fixed camera that was moved.
+    one. ``sigma_px`` is the expected RMS error of the frame's corners in the world, in pixels of
+    the first keyframe, NaN if it is not known. ``warning`` says what is wrong although the pose is
+    given: a fixed camera that was moved.
     ``kind`` is what `--camera auto` takes the camera for in this frame, None if it was told.
     """
 
@@ -381,6 +383,7 @@ class CameraPose:
     is_keyframe: bool = False
     warning: str = ""
     kind: CameraKind | None = None
+    sigma_px: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

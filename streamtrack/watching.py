@@ -263,7 +263,12 @@ class MosaicWatcher:
         self._last = frame.index, frame.time_s
         world_from_frame = None if reason else pose.world_from_frame
         state = "placed" if not reason else "lost" if pose.world_from_frame is None else "refused"
-        found = {"inliers": float(pose.inliers), "rmse_px": pose.rmse_px, "paint_ms": self.paint_ms}
+        found = {
+            "inliers": float(pose.inliers),
+            "rmse_px": pose.rmse_px,
+            "sigma_px": pose.sigma_px,
+            "paint_ms": self.paint_ms,
+        }
         metrics = {name: value for name, value in found.items() if math.isfinite(value)}
         placed = PlacedFrame(
             frame.index, frame.time_s, frame.size_wh, state, world_from_frame, reason, metrics
@@ -334,9 +339,8 @@ def _add_poses(
     def watch(step: Step) -> None:
         frame, pose = step.frame, step.camera
         reason = pose.reason if result.mosaic is None else result.mosaic.reason
-        add(
-            frame.index, frame.name, frame.time_s, None if reason else pose.world_from_frame, reason
-        )
+        world_from_frame = None if reason else pose.world_from_frame
+        add(frame.index, frame.name, frame.time_s, world_from_frame, reason, pose.sigma_px)
 
     def complete(_advance: object) -> None:
         if final is not None:

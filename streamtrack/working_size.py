@@ -139,10 +139,11 @@ def mapped_track(track: Track, new_from_frame: Matrix, new_from_template: Matrix
 
 def _mapped_pose(pose: CameraPose, new_from_world: Matrix, new_from_frame: Matrix) -> CameraPose:
     rmse_px = pose.rmse_px * _factor(new_from_frame)
+    sigma_px = pose.sigma_px * _factor(new_from_world)
     if pose.world_from_frame is None:
         return replace(pose, rmse_px=rmse_px)
     world_from_frame = new_from_world @ pose.world_from_frame @ inverted(new_from_frame)
-    return replace(pose, world_from_frame=world_from_frame, rmse_px=rmse_px)
+    return replace(pose, world_from_frame=world_from_frame, rmse_px=rmse_px, sigma_px=sigma_px)
 
 
 def _factor(new_from_old: Matrix) -> float:
@@ -193,6 +194,9 @@ class FullSizeGraph:
     def world_from_frame(self, index: int) -> Matrix | None:
         pose = self._graph.world_from_frame(index)
         return None if pose is None else self._full(pose)
+
+    def sigma_px(self, index: int) -> float:
+        return self._graph.sigma_px(index) * _factor(self._full_from_small)
 
     def keep(self, index: int) -> None:
         self._graph.keep(index)

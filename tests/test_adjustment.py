@@ -11,7 +11,7 @@ import pytest
 from streamtrack import geometry
 from streamtrack.evaluation import corner_error
 from streamtrack.fitting import fit
-from streamtrack.mosaic import bundle
+from streamtrack.mosaic import normal_equations
 from streamtrack.mosaic.adjustment import adjust
 from streamtrack.mosaic.types import Link
 from streamtrack.types import Matches, Matrix, Model, Points, Registration, Size, Verdict
@@ -201,6 +201,28 @@ def test_tilted_pictures_tell_where_level_is(
     assert np.mean(after) < 0.75 * np.mean(before)
 
 
+def test_errors_are_about_as_large_as_expected() -> None:
+    ratios = []
+    for seed in range(6):
+        graph = tilted_way(0, 1, 704.0, seed)
+        found = adjust(graph.start, graph.links, graph.sizes, 0, Model.HOMOGRAPHY, is_near=True)
+        expected = found.expected_errors_px(noise_px=0.03)
+        assert expected[0] == pytest.approx(0, abs=1e-3)
+        assert expected[39] > 2 * expected[20] > 0
+        errors = graph.errors(found.world_from_picture)
+        ratios += [errors[i] / expected[i] for i in (10, 20, 30, 39)]
+    assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 2.0
+
+
+def test_a_closed_loop_is_expected_to_be_right_at_its_end() -> None:
+    graph = flight(bend=0.004)
+    found = adjust(graph.start, graph.links, graph.sizes, 0, Model.HOMOGRAPHY)
+    expected = found.expected_errors_px(noise_px=0.1)
+    lane = [link for link in graph.links if abs(link.a - link.b) == 1]
+    chain = adjust(graph.start, lane, graph.sizes, 0, Model.HOMOGRAPHY)
+    assert expected[23] < chain.expected_errors_px(noise_px=0.1)[23] / 4
+
+
 def test_a_homography_does_not_drift_where_a_similarity_would_do() -> None:
     """The gauge that links leave open is held by what the poses have in common."""
     graph = flight(count=40)
@@ -313,9 +335,9 @@ def test_pairs_on_one_line_leave_finite_poses() -> None:
 
 def test_sparse_and_dense_equations_have_one_solution(monkeypatch: pytest.MonkeyPatch) -> None:
     graph = flight(count=40, bend=0.004)
-    monkeypatch.setattr(bundle, "_DENSE_UNKNOWNS", 10**9)
+    monkeypatch.setattr(normal_equations, "_DENSE_UNKNOWNS", 10**9)
     dense = adjust(graph.start, graph.links, graph.sizes, 0, Model.HOMOGRAPHY)
-    monkeypatch.setattr(bundle, "_DENSE_UNKNOWNS", 0)
+    monkeypatch.setattr(normal_equations, "_DENSE_UNKNOWNS", 0)
     sparse = adjust(graph.start, graph.links, graph.sizes, 0, Model.HOMOGRAPHY)
     for i, pose in dense.world_from_picture.items():
         assert corner_error(sparse.world_from_picture[i], pose, SIZE) < 1e-3

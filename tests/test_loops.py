@@ -60,6 +60,16 @@ def test_the_flight_closes_on_itself(flown: tuple[Clip, MovingCamera, list[Camer
     assert sum(pose.is_keyframe for pose in found) == len(graph.keyframes) < len(clip.frames) / 2
 
 
+def test_errors_are_expected(flown: tuple[Clip, MovingCamera, list[CameraPose]]) -> None:
+    clip, camera, found = flown
+    sigmas = [camera.graph.sigma_px(i) for i in range(len(clip.frames))]
+    assert np.isfinite([pose.sigma_px for pose in found]).all()
+    assert sigmas[0] < 1e-9 and sigmas[-1] < max(sigmas)
+    assert np.isnan(camera.graph.sigma_px(10_000))
+    errors = np.array(final_errors(clip, camera))
+    assert np.mean(errors[1:] < 3 * np.array(sigmas[1:])) > 0.9
+
+
 def test_edges_agree_with_the_truth(flown: tuple[Clip, MovingCamera, list[CameraPose]]) -> None:
     clip, camera, _ = flown
     for link in camera.graph.links:

@@ -29,12 +29,12 @@ def test_poses_read_back_exactly(tmp_path: Path) -> None:
     pose[2, :2] = 1.23456789e-7, -3e-12
     path = tmp_path / "poses.csv"
     with PosesWriter(path) as writer:
-        writer.write_pose(0, 'a,"b".png', 0.0, pose, "")
+        writer.write_pose(0, 'a,"b".png', 0.0, pose, "", 0.25)
         writer.write_pose(1, "", 1 / 30, None, "too few matches")
         writer.write_skipped(Skipped(2, "c.png", "not a picture, or broken"))
     rows = rows_of(path)
     assert list(rows[0])[:7] == ["frame", "name", "time_s", "status", "reason", "h11", "h12"]
-    assert list(rows[0])[-1] == "h33"
+    assert list(rows[0])[-2:] == ["h33", "world_sigma_px"]
     np.testing.assert_array_equal(matrix_of(rows[0]), pose)
     assert [(row["frame"], row["status"], row["reason"]) for row in rows] == [
         ("0", "used", ""),
@@ -43,6 +43,7 @@ def test_poses_read_back_exactly(tmp_path: Path) -> None:
     ]
     assert rows[0]["name"] == 'a,"b".png'
     assert [row["time_s"] for row in rows] == ["0.000000", "0.033333", ""]
+    assert [row["world_sigma_px"] for row in rows] == ["0.250", "", ""]
     assert rows[1]["h11"] == rows[2]["h33"] == ""
 
 
@@ -60,6 +61,9 @@ class Moved:
 
     def world_from_frame(self, index: int) -> Matrix | None:
         return None if index == 3 else translation(10.0 * index, 0.0)
+
+    def sigma_px(self, index: int) -> float:
+        return 0.25 * index
 
 
 def test_final_poses_are_those_known_at_the_end(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import ClassVar
 
@@ -71,6 +72,9 @@ class Graph:
 
     def keyframe_of(self, index):
         return None
+
+    def sigma_px(self, index):
+        return math.nan
 
     def move(self, shift):
         self.revision += shift != self.shift

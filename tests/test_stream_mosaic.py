@@ -249,6 +249,9 @@ class Graph:
     def keyframe_of(self, index: int) -> int | None:
         return None
 
+    def sigma_px(self, index: int) -> float:
+        return float("nan")
+
 
 def test_moved_keyframes_are_painted_anew(tmp_path: Path, make_picture: MakePicture) -> None:
     """As after a loop closure: poses had drifted, then they are put right."""

@@ -162,7 +162,8 @@ class AutoCamera:
         keyframe, keyframe_from_frame = standing.keyframe, standing.keyframe_from_frame
         self.graph.add_frame(view.frame.index, keyframe, keyframe_from_frame)
         pose = standing.pose(self.graph)
-        return replace(found, world_from_frame=pose, kind=CameraKind.FIXED)
+        sigma_px = self.graph.sigma_px(standing.keyframe)
+        return replace(found, world_from_frame=pose, kind=CameraKind.FIXED, sigma_px=sigma_px)
 
 
 class _Rest:

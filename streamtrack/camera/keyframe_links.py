@@ -33,6 +33,9 @@ _MAX_LOOPS = 2
 _RECENT = 8  # keyframes taken shortly before are neighbours, others are loops
 _WINDOW = 4  # keyframes whose poses a new edge may move at once
 _LEVELS_KEPT = 24
+_NOISE_SHARE = 0.6
+"""Of the shifts that a link's cells would still like to make, the noise of its pairs: measured on
+flights with known poses, so that errors are about as large as expected."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,6 +151,7 @@ class Draft:
         self._added: list[tuple[Link, bool]] = []
         self._dropped: set[tuple[int, int]] = set()
         self._moved: dict[int, Matrix] = {}
+        self._sigmas_px: Mapping[int, float] | None = None
 
     def add(self, link: Link, is_loop: bool) -> None:
         """Join two keyframes."""
@@ -166,6 +170,10 @@ class Draft:
             self.keyframes[index] = replace(self.keyframes[index], world_from_keyframe=pose)
         self._moved.update(world_from_keyframe)
 
+    def expect(self, sigmas_px: Mapping[int, float]) -> None:
+        """Say how far off keyframes may be."""
+        self._sigmas_px = sigmas_px
+
     def publish(self, graph: KeyframeGraph) -> None:
         """Make the changes in the graph, which may have grown since."""
         if self._dropped:
@@ -174,6 +182,8 @@ class Draft:
             graph.add_link(link, is_loop)
         if self._moved:
             graph.move(self._moved)
+        if self._sigmas_px is not None:
+            graph.expect(self._sigmas_px)
 
 
 def measure_exactly(draft: Draft, new: NewKeyframe, levels: ViewLevels) -> None:
@@ -252,7 +262,10 @@ def _try(draft: Draft, new: NewKeyframe, other: int, cache: LevelCache) -> Joine
 
 
 def adjust_all(draft: Draft) -> None:
-    """Adjust all poses to all links, and drop links that disagree with the others."""
+    """Adjust all poses to all links, and drop links that disagree with the others.
+
+    What errors are expected of the poses is told, too.
+    """
     keyframes, links = draft.keyframes, draft.links
     sizes = {index: keyframe.size_wh for index, keyframe in keyframes.items()}
     poses = {index: keyframe.world_from_keyframe for index, keyframe in keyframes.items()}
@@ -260,6 +273,10 @@ def adjust_all(draft: Draft) -> None:
     adjusted = adjust(poses, links, sizes, first, Model.HOMOGRAPHY, is_near=True)
     draft.drop({(links[row].a, links[row].b) for row in adjusted.rejected})
     draft.move(adjusted.world_from_picture)
+    rmse_px = [link.rmse_px for link in links if np.isfinite(link.rmse_px)]
+    if rmse_px:
+        noise_px = _NOISE_SHARE * float(np.sqrt(np.mean(np.square(rmse_px))))
+        draft.expect(adjusted.expected_errors_px(noise_px))
 
 
 def adjust_around(draft: Draft) -> None:

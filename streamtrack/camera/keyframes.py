@@ -12,6 +12,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import hypot
 from types import MappingProxyType
 
 import cv2
@@ -28,6 +29,7 @@ from streamtrack.types import Image, Matrix, Points, Size
 _JPEG_QUALITY = 92
 _MAX_PICTURES_MB = 128.0
 _VISIBLE_PX = 0.02
+_LINK_SIGMA_PX = 0.05  # of one keyframe against the next
 
 
 class PictureStore:
@@ -120,6 +122,7 @@ class KeyframeGraph:
         self._edges: list[KeyframeEdge] = []
         self._frames = FramePoses(most_frames)
         self._revision = 0
+        self._sigmas_px: dict[int, float] = {}
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]:
@@ -159,6 +162,34 @@ class KeyframeGraph:
         frame = self.frame_pose(index)
         return None if frame is None else frame.keyframe
 
+    def sigma_px(self, index: int) -> float:
+        """Expected RMS error of a frame's corners in the world, in pixels of the first frame.
+
+        That of its keyframe at the last adjustment of all. Those taken since then are told of by
+        their number: the errors of a chain grow about as the square of its length. NaN for a frame
+        that is not known.
+        """
+        keyframe = self.keyframe_of(index)
+        if keyframe is None:
+            return float("nan")
+        own = 0.0 if index in self._keyframes else _LINK_SIGMA_PX
+        return hypot(self._keyframe_sigma_px(keyframe), own)
+
+    def _keyframe_sigma_px(self, keyframe: int) -> float:
+        sigmas, since = self._sigmas_px, 0
+        for other in reversed(self._keyframes):
+            if other in sigmas:
+                break
+            since += other <= keyframe
+        if keyframe in sigmas:
+            return sigmas[keyframe]
+        last, known = next(reversed(sigmas.values())), len(sigmas)
+        return last * (1 + since / known) ** 2 + _LINK_SIGMA_PX * since
+
+    def expect(self, sigmas_px: Mapping[int, float]) -> None:
+        """Say what errors are expected of keyframes, in the order they were taken."""
+        self._sigmas_px = dict(sigmas_px)
+
     def frame_pose(self, index: int) -> FramePose | None:
         """The frame's own measurement: against which keyframe, and where in it."""
         if index in self._keyframes:
@@ -182,6 +213,8 @@ class KeyframeGraph:
         size_wh = (image.shape[1], image.shape[0])
         outlines = tuple(hidden)
         keyframe = Keyframe(index, time_s, size_wh, picture, world_from_keyframe, outlines)
+        if not self._keyframes:
+            self._sigmas_px = {index: 0.0}
         with self._lock:
             # Readers may be going through the old dict: it is replaced, not changed.
             self._keyframes = {**self._keyframes, index: keyframe}

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import hypot
 from typing import Protocol
 
 import numpy as np
@@ -142,7 +143,9 @@ class MovingCamera:
         self._take(sight.view, reference, np.eye(3), None)
         self._shear.begin(index)
         self._state = _State(index, np.eye(3), sight.levels, sight.time_s, None, 0.0)
-        return CameraPose(np.eye(3), cells, cells, 0.0, keyframe=index, is_keyframe=True)
+        return CameraPose(
+            np.eye(3), cells, cells, 0.0, keyframe=index, is_keyframe=True, sigma_px=0.0
+        )
 
     def _follow(self, state: _State, sight: Sight) -> ViewAlignment:
         """The frame against the keyframe of the frame before, where the motion leads or leaves."""
@@ -206,7 +209,8 @@ class MovingCamera:
             moved = self.graph.world_from_frame(sight.index)
             world_from_frame = world_from_frame if moved is None else moved
         pose = placed.camera_pose(world_from_frame)
-        return replace(pose, keyframe=keyframe, is_keyframe=is_keyframe)
+        sigma_px = hypot(self.graph.sigma_px(keyframe), found.corner_sigma_px)
+        return replace(pose, keyframe=keyframe, is_keyframe=is_keyframe, sigma_px=sigma_px)
 
     def _in_world(self, keyframe: int, keyframe_from_frame: Matrix) -> Matrix:
         world_from_keyframe = self.graph.keyframes[keyframe].world_from_keyframe

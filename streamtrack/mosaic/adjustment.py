@@ -9,7 +9,7 @@ poses are held to what a camera with square pixels can show of a plane (`mosaic.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import log
 from typing import Literal
 
@@ -19,14 +19,15 @@ from streamtrack import geometry
 from streamtrack.fitting import DEGREES_OF_FREEDOM, fit, transfer_errors
 from streamtrack.mosaic.bundle import (
     MIN_NOISE_PX,
-    Doubles,
     Problem,
-    Rows,
     Solution,
     estimated_noise_px,
     solve,
     transfer_errors_of,
 )
+from streamtrack.mosaic.drift import expected_errors_px
+from streamtrack.mosaic.normal_equations import Doubles, Rows
+from streamtrack.mosaic.prior import NO_PRIOR
 from streamtrack.mosaic.types import Adjusted, Link
 from streamtrack.types import Matrix, Model, Size
 
@@ -35,6 +36,25 @@ _MAX_CELL_PAIRS = 40.0  # more in one cell count no more
 _LADDER = (Model.SIMILARITY, Model.AFFINE, Model.HOMOGRAPHY)
 _NEAR_ROUNDS = 12
 _GAIN_OF_FREEDOM = 0.02  # share of the noise that a richer model must take away
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solved(Adjusted):
+    """Poses, and what they rest on; ``pictures`` are those of the solution's rows."""
+
+    problem: Problem
+    solution: Solution
+    pictures: Sequence[int]
+
+    def expected_errors_px(self, noise_px: float) -> dict[int, float]:
+        """Expected RMS error of each picture's corners in the world, the anchor's pixels.
+
+        ``noise_px`` is the standard deviation of a pair's error along x and y.
+        """
+        if self.problem.links == 0:
+            return {}
+        expected = expected_errors_px(self.problem, self.solution, noise_px)
+        return {picture: float(expected[i]) for i, picture in enumerate(self.pictures)}
 
 
 def adjust(
@@ -46,7 +66,7 @@ def adjust(
     *,
     fixed: Collection[int] = (),
     is_near: bool = False,
-) -> Adjusted:
+) -> Solved:
     """The poses that the links' inlier pairs agree with best, the anchor's kept as it is.
 
     ``world_from_picture`` are rough poses to start from, ``sizes`` the (width, height) of the
@@ -94,7 +114,7 @@ def adjust(
     for picture in held & kept:
         poses[picture] = world_from_picture[picture]
     rmse_px = float(np.sqrt(np.mean(link_rmse_px[is_used] ** 2))) if is_used.any() else float("nan")
-    return Adjusted(poses, solution.model, rmse_px, link_rmse_px, is_used)
+    return Solved(poses, solution.model, rmse_px, link_rmse_px, is_used, problem, solution, order)
 
 
 def _pairs_rmse_px(link: Link, b_from_a: Matrix) -> float:
@@ -218,7 +238,7 @@ def _climb(
     top = Model.HOMOGRAPHY if model == "auto" else model
     if problem.links == 0:
         empty = np.zeros((0, 1))
-        return Solution(start, top, empty, empty, np.zeros(0, np.bool_), MIN_NOISE_PX)
+        return Solution(start, top, empty, empty, np.zeros(0, np.bool_), MIN_NOISE_PX, NO_PRIOR)
     if is_near:
         return _rooted(problem, anchor, solve(problem, anchored, top, rounds=_NEAR_ROUNDS))
     ladder = [step for step in _LADDER if step is top or step in _LADDER[: _rung(top)]]

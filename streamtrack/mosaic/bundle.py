@@ -13,18 +13,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from streamtrack.mosaic.levelling import levelled
+from streamtrack.mosaic.normal_equations import Doubles, Normal, Rows
 from streamtrack.mosaic.prior import NO_PRIOR, Prior, first_prior
 from streamtrack.types import Mask, Model
 from streamtrack.uncertainty import MODEL_BASES, motion_rows
-
-Doubles: TypeAlias = npt.NDArray[np.float64]
-Rows: TypeAlias = npt.NDArray[np.intp]
 
 _MAX_ROUNDS = 30
 _CONVERGED_PX = 5e-3
@@ -32,7 +28,6 @@ MIN_NOISE_PX = 0.05
 _MIN_TOLERANCE_PX = 1.0  # links are never wrong for less than three times this
 _HUBER = 1.345  # times the noise: 95 % efficient for Gaussian errors
 _MIN_EXPOSURES = 0.25  # of the links
-_DENSE_UNKNOWNS = 240
 _DAMPING = 1e-9
 _MAX_DAMPING = 1e3
 
@@ -83,7 +78,10 @@ class Problem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Poses (n, 3, 3) of a model; ``errors_px`` (2 L, K) of all pairs, ``is_used`` (L,)."""
+    """Poses (n, 3, 3) of a model; ``errors_px`` (2 L, K) of all pairs, ``is_used`` (L,).
+
+    ``prior`` is what the poses were held to, in a level world.
+    """
 
     poses: Doubles
     model: Model
@@ -91,6 +89,7 @@ class Solution:
     counts: Doubles
     is_used: Mask
     noise_px: float
+    prior: Prior
 
     def cost(self, noise_px: float) -> float:
         """Bounded sum of squares over all pairs, in units of the noise."""
@@ -136,7 +135,7 @@ def solve(
                 break
             damping *= 10
             if damping > _MAX_DAMPING:
-                return _finished(problem, poses, errors, rejection, model)
+                return _finished(problem, poses, errors, rejection, model, prior)
         damping = max(damping / 10, _DAMPING)
         moved_px = float(np.max(np.abs(change) * problem.unit_px[:, None]))
         poses, errors = moved, moved_errors
@@ -145,15 +144,20 @@ def solve(
         is_final = rejection.tighten(errors)
         if moved_px < _CONVERGED_PX and is_final and tried > 2:
             break
-    return _finished(problem, poses, errors, rejection, model)
+    return _finished(problem, poses, errors, rejection, model, prior)
 
 
 def _finished(
-    problem: Problem, poses: Doubles, errors: Doubles, rejection: _Rejection, model: Model
+    problem: Problem,
+    poses: Doubles,
+    errors: Doubles,
+    rejection: _Rejection,
+    model: Model,
+    prior: Prior,
 ) -> Solution:
     is_used = rejection.is_used(errors)
     noise_px = estimated_noise_px(problem, errors, is_used)
-    return Solution(poses, model, np.minimum(errors, 1e6), problem.counts, is_used, noise_px)
+    return Solution(poses, model, np.minimum(errors, 1e6), problem.counts, is_used, noise_px, prior)
 
 
 class _Rejection:
@@ -286,6 +290,21 @@ def _step(
     problem: Problem, poses: Doubles, weights: Doubles, prior: Prior, model: Model, damping: float
 ) -> Doubles:
     """The change D (n, 8) of every pose that minimises the linearised cost."""
+    normal, vector = equations(problem, poses, weights, prior, model, damping)
+    change = np.zeros((len(poses), 8))
+    change[~problem.is_held] = normal.solved(vector) @ MODEL_BASES[model].T
+    return change
+
+
+def equations(
+    problem: Problem,
+    poses: Doubles,
+    weights: Doubles,
+    prior: Prior,
+    model: Model,
+    damping: float = _DAMPING,
+) -> tuple[Normal, Doubles]:
+    """The normal equations of the free poses: the matrix, and the vector (n, k)."""
     freedoms = MODEL_BASES[model]
     k, count = freedoms.shape[1], len(poses)
     residuals, by_a, by_b = _jacobians(problem, poses, model)
@@ -323,47 +342,8 @@ def _step(
     row, column = place[problem.a], place[problem.b]
     is_between = (row >= 0) & (column >= 0)
     blocks = (ja_t @ jb)[is_between]
-    normal = _Normal(diagonal[is_free], row[is_between], column[is_between], blocks)
-    change = np.zeros((count, 8))
-    change[is_free] = _solved(normal, vector[is_free]) @ freedoms.T
-    return change
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Normal:
-    """A symmetric matrix of k x k blocks: (n, k, k) on its diagonal, (m, k, k) at (row, column).
-
-    Blocks at the same place add up, and each stands transposed at (column, row) too.
-    """
-
-    diagonal: Doubles
-    row: Rows
-    column: Rows
-    blocks: Doubles
-
-
-def _solved(normal: _Normal, vector: Doubles) -> Doubles:
-    """Solution (n, k) of ``normal`` times it = ``vector`` (n, k)."""
-    count, k = vector.shape
-    every = np.arange(count)
-    row = np.concatenate([every, normal.row, normal.column])
-    column = np.concatenate([every, normal.column, normal.row])
-    blocks = np.concatenate([normal.diagonal, normal.blocks, normal.blocks.transpose(0, 2, 1)])
-    if count * k <= _DENSE_UNKNOWNS:
-        dense = np.zeros((count, count, k, k))
-        np.add.at(dense, (row, column), blocks)
-        square = dense.transpose(0, 2, 1, 3).reshape(count * k, count * k)
-        return np.asarray(np.linalg.solve(square, vector.ravel()), np.float64).reshape(count, k)
-    from scipy.sparse import coo_array
-    from scipy.sparse.linalg import splu
-
-    shape = blocks.shape
-    inner = np.arange(k)
-    rows = np.broadcast_to(row[:, None, None] * k + inner[:, None], shape).ravel()
-    columns = np.broadcast_to(column[:, None, None] * k + inner, shape).ravel()
-    square = coo_array((blocks.ravel(), (rows, columns)), shape=(count * k, count * k)).tocsc()
-    factors = splu(square, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-    return np.asarray(factors.solve(vector.ravel()), np.float64).reshape(count, k)
+    normal = Normal(diagonal[is_free], row[is_between], column[is_between], blocks)
+    return normal, vector[is_free]
 
 
 def _moved(problem: Problem, poses: Doubles, change: Doubles) -> Doubles:

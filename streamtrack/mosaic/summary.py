@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from streamtrack.sources.live_status import LiveStatus
 
 _MORE_LABELS = {
+    "expected_drift_px": ("Expected drift at the end", " px"),
+    "expected_drift_most_px": ("Expected drift at most", " px"),
     "spilled_mb": ("Spilled to disk", " MB"),
     "ms_per_frame_p95": ("Time a frame, p95", " ms"),
     "ghost_index_undecided": ("Ghost index, undecided", ""),

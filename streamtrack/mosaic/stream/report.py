@@ -14,7 +14,7 @@ from streamtrack.meters import LogHistogram, peak_rss_mb
 from streamtrack.mosaic.stream.export import Exported
 from streamtrack.mosaic.summary import LinkSummary, MosaicSummary
 from streamtrack.mosaic.types import Link, Placement, Status
-from streamtrack.pose_graph import KeyframeEdge
+from streamtrack.pose_graph import ExpectedDrift, KeyframeEdge
 from streamtrack.settings import Settings
 from streamtrack.sources.base import FrameSource
 from streamtrack.sources.live_status import LiveStatus
@@ -42,6 +42,8 @@ class _Graph(Protocol):
 
     @property
     def edges(self) -> Sequence[KeyframeEdge]: ...
+
+    def sigma_px(self, index: int) -> float: ...
 
 
 class StreamReport:
@@ -141,8 +143,11 @@ class StreamReport:
         self, edges: Sequence[KeyframeEdge], exported: Exported | None, corrupt_packets: int
     ) -> dict[str, Any]:
         mosaic, p95_ms = self._mosaic.mosaic, self._ms.quantile(0.95)
+        drift = ExpectedDrift.of(self._graph)
         more: dict[str, Any] = {
             "keyframes": len(self._graph.keyframes),
+            "expected_drift_px": drift and round(drift.end_px, 3),
+            "expected_drift_most_px": drift and round(drift.most_px, 3),
             "loops_closed": sum(edge.is_loop for edge in edges),
             "frames_painted": mosaic.figures.painted,
             "frames_kept": mosaic.views,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import hypot, log
+from math import hypot, log, sqrt
 from typing import Any
 
 import cv2
@@ -22,6 +22,7 @@ DEGREES_OF_FREEDOM = {
     Model.AFFINE: 6,
     Model.HOMOGRAPHY: 8,
 }
+_FEW = 8
 _MIN_NOISE_PX = 0.05
 """Smaller differences between models are not worth a further freedom."""
 
@@ -89,6 +90,8 @@ def median(values: npt.NDArray[Any]) -> float:
 
 def fit(model: Model, a: Points, b: Points, weights: Doubles | None = None) -> Matrix:
     """Weighted least-squares mapping of a model from pairs (M, 2); ``weights`` (M,)."""
+    if model is Model.SIMILARITY and weights is None and len(a) <= _FEW:
+        return _similarity_of_few(a, b)[0]
     pa, pb = a.astype(np.float64), b.astype(np.float64)
     w = np.ones(len(a))
     if weights is not None:
@@ -112,6 +115,28 @@ def _fit_similarity(a: Doubles, b: Doubles, w: Doubles) -> Matrix:
     s = complex(za_weighted @ zb) / spread if spread > 0 else 1.0 + 0j
     t = complex(w @ zb) / float(w.sum()) - s * mean_a
     return np.array([[s.real, -s.imag, t.real], [s.imag, s.real, t.imag], [0.0, 0.0, 1.0]])
+
+
+def similarity_misfit_px(a: Points, b: Points) -> float:
+    """How far (RMS) few points b (M, 2) are from any similarity of a."""
+    return _similarity_of_few(a, b)[1]
+
+
+def _similarity_of_few(a: Points, b: Points) -> tuple[Matrix, float]:
+    """As `_fit_similarity`, unweighted, with the RMS of what is left.
+
+    In plain numbers: for four corners numpy would be several times as slow.
+    """
+    za, zb = ([complex(x, y) for x, y in points.tolist()] for points in (a, b))
+    mean_a, mean_b = sum(za) / len(za), sum(zb) / len(zb)
+    za, zb = [z - mean_a for z in za], [z - mean_b for z in zb]
+    spread = sum(abs(z) ** 2 for z in za)
+    both = sum(from_a.conjugate() * from_b for from_a, from_b in zip(za, zb, strict=True))
+    s = both / spread if spread > 0 else 1.0 + 0j
+    t = mean_b - s * mean_a
+    left = sum(abs(from_b - s * from_a) ** 2 for from_a, from_b in zip(za, zb, strict=True))
+    matrix = np.array([[s.real, -s.imag, t.real], [s.imag, s.real, t.imag], [0.0, 0.0, 1.0]])
+    return matrix, sqrt(left / len(za))
 
 
 def _fit_affine(a: Doubles, b: Doubles, w: Doubles) -> Matrix:

@@ -24,14 +24,15 @@ def transform_points(b_from_a: Matrix, points: npt.ArrayLike) -> Points:
     (a, b, c), (d, e, f), (g, h, i) = b_from_a.tolist()
     if len(pts) <= _FEW:
         # Without numpy's overhead, which for the corners of a quad is nearly all there is.
-        mapped = array("f")
+        mapped: list[float] = []
         for x, y in pts.tolist():
             depth = g * x + h * y + i
             if not abs(depth) > _NEAR_HORIZON:
                 break
-            mapped.extend(((a * x + b * y + c) / depth, (d * x + e * y + f) / depth))
+            mapped += (a * x + b * y + c) / depth, (d * x + e * y + f) / depth
         else:
-            return np.frombuffer(mapped, np.float32).reshape(-1, 2)
+            # Silent where a number is beyond float32's range.
+            return np.frombuffer(array("f", mapped), np.float32).reshape(-1, 2)
     matrix = np.asarray(b_from_a, np.float64)
     result: Points = np.empty((len(pts), 2), np.float32)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

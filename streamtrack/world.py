@@ -39,12 +39,12 @@ class WorldPath:
     def __init__(self, graph: PoseGraph | None) -> None:
         self._graph = graph
         self._lock = threading.Lock()  # displays read paths in threads of their own
-        self._revision = 0 if graph is None else graph.revision
         self._count = 0
         self._frames = np.zeros(64, np.int64)
         self._times_s = np.zeros(64)
         self._in_frame = np.zeros((64, 2))
         self._positions = np.zeros((64, 2))
+        self._revisions = np.zeros(64, np.int64)  # of the graph, at which each position is known
 
     def add(self, frame: Frame, in_frame: Doubles, position: Doubles) -> None:
         """Add the position (2,) in a frame and in the world."""
@@ -56,10 +56,11 @@ class WorldPath:
             row = self._count
             self._frames[row], self._times_s[row] = frame.index, frame.time_s
             self._in_frame[row], self._positions[row] = in_frame, position
+            self._revisions[row] = 0 if self._graph is None else self._graph.revision
             self._count += 1
 
     def _columns(self) -> dict[str, npt.NDArray[np.generic]]:
-        names = ("_frames", "_times_s", "_in_frame", "_positions")
+        names = ("_frames", "_times_s", "_in_frame", "_positions", "_revisions")
         return {name: getattr(self, name) for name in names}
 
     def _grow(self) -> None:
@@ -74,14 +75,12 @@ class WorldPath:
     def points(self, last_frame: int) -> Points:
         """Positions (N, 2) up to a frame, where they lie by what is known now."""
         with self._lock:
-            self._follow_keyframes()
             count = int(np.searchsorted(self._frames[: self._count], last_frame, side="right"))
+            self._follow_keyframes(range(count))
             return self._positions[:count].astype(np.float32)
 
     def recent(self) -> tuple[Doubles, Doubles]:
         """Times (N,) and positions (N, 2) of the last moments, as far as they are used."""
-        with self._lock:
-            self._follow_keyframes()
         times = self._times_s[: self._count]
         first = int(np.searchsorted(times, times[-1] - _WINDOW_S - 1e-9))
         if self._count - first < _LEAST_IN_WINDOW:
@@ -89,17 +88,21 @@ class WorldPath:
             first = max(self._count - _LEAST_IN_WINDOW, earliest, 0)
         step = -(-(self._count - first) // _MOST_IN_WINDOW)
         rows = slice(first + (self._count - 1 - first) % step, self._count, step)
+        with self._lock:
+            self._follow_keyframes(range(self._count)[rows])
         return times[rows], self._positions[rows]
 
-    def _follow_keyframes(self) -> None:
-        graph = self._graph
-        if graph is None or graph.revision == self._revision:
+    def _follow_keyframes(self, rows: range) -> None:
+        """Bring those of the positions up to date that were known before keyframes moved."""
+        if self._graph is None:
             return
-        self._revision = graph.revision
-        for row in range(self._count):
-            pose = graph.world_from_frame(int(self._frames[row]))
+        revision = self._graph.revision
+        old = self._revisions[rows.start : rows.stop : rows.step] != revision
+        for row in np.asarray(rows)[old].tolist():
+            pose = self._graph.world_from_frame(int(self._frames[row]))
             if pose is not None:
                 self._positions[row] = geometry.transform_points(pose, self._in_frame[row])[0]
+            self._revisions[row] = revision
 
 
 class WorldMotion:

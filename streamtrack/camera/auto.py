@@ -90,17 +90,15 @@ class AutoCamera:
         if self._standing is not None:
             return self._glance(self._standing, view, tracks)
         pose = self._moving.update(view, tracks)
-        if pose.world_from_frame is not None and pose.keyframe is not None:
-            self._look_for_rest(pose.world_from_frame, pose.keyframe, view, tracks)
+        if not view.levels.is_flat():
+            self._look_for_rest(pose, view, tracks)
         return replace(pose, kind=CameraKind.MOVING)
 
     def close(self) -> None:
         """Finish the work on loops."""
         self._moving.close()
 
-    def _look_for_rest(
-        self, pose: Matrix, keyframe: int, view: FrameView, tracks: Sequence[Track]
-    ) -> None:
+    def _look_for_rest(self, pose: CameraPose, view: FrameView, tracks: Sequence[Track]) -> None:
         """Has the picture been the same for long enough? From here on the camera stands then.
 
         While every look finds another picture the camera moves, and is looked at ever more seldom.
@@ -108,12 +106,13 @@ class AutoCamera:
         levels, hidden, rest = view.levels, _hidden(tracks), self._rest
         if rest is None:
             self._frames_to_look -= 1
-            if self._frames_to_look < 0:
+            if self._frames_to_look < 0 and pose.world_from_frame is not None:
                 self._rest = self._begun_rest(view, hidden)
         elif _is_at_rest(rest.check.of(levels, hidden), rest.check, levels, _BEGINS):
             rest.add(pose, view.size_wh)
             self._pause = 0
-            if rest.frames >= self._needed:
+            keyframe = rest.keyframe
+            if rest.frames >= self._needed and keyframe is not None:
                 found = rest.pose(view.size_wh)
                 world_from_keyframe = self.graph.keyframes[keyframe].world_from_keyframe
                 in_keyframe = geometry.normalized(geometry.inverted(world_from_keyframe) @ found)
@@ -167,12 +166,17 @@ class AutoCamera:
 
 
 class _Rest:
-    """How long the picture has been as in one frame, and the pose that was estimated meanwhile."""
+    """How long the picture has been as in one frame, and the pose that was estimated meanwhile.
+
+    ``keyframe`` is the one that was last seen.
+    """
 
     def __init__(self, check: StandCheck, is_start: bool) -> None:
         self.check = check
         self.frames = 0
+        self.keyframe: int | None = None
         self._others = 0
+        self._poses = 0
         self._is_start = is_start
         self._corners = np.zeros((4, 2))
 
@@ -184,16 +188,20 @@ class _Rest:
         self._others += 1
         return self.frames == 0 or self._others >= _OTHER_FRAMES
 
-    def add(self, world_from_frame: Matrix, size_wh: Size) -> None:
-        corners = geometry.transform_points(world_from_frame, geometry.image_quad(size_wh))
+    def add(self, pose: CameraPose, size_wh: Size) -> None:
+        """One more frame like that; its pose need not be known."""
         self.frames, self._others = self.frames + 1, 0
-        self._corners += corners
+        if pose.world_from_frame is not None:
+            corners = geometry.image_quad(size_wh)
+            self._corners += geometry.transform_points(pose.world_from_frame, corners)
+            self._poses += 1
+            self.keyframe = pose.keyframe
 
     def pose(self, size_wh: Size) -> Matrix:
         """The mean pose; the world's own if the picture is that of its first frame."""
         if self._is_start:
             return np.eye(3)
-        mean = np.asarray(self._corners / self.frames, np.float32)
+        mean = np.asarray(self._corners / self._poses, np.float32)
         return geometry.quad_mapping(geometry.image_quad(size_wh), mean)
 
 

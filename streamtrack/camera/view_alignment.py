@@ -44,12 +44,13 @@ _ROUNDS = (6, 8, 4, 4, 4)  # at most, by level
 _SAME_PX = 0.5  # of a level: starts that differ by no more lead to the same end
 _MAX_LAST_STEP_PX = 1.0  # of a fit that counts as converged
 _CONVERGED_PX = 0.04  # what a further step would still move is about a tenth of it
-_CONVERGED_COARSE_PX = 0.3
+_CONVERGED_COARSE_PX = 0.15
 _PERSPECTIVE_SIGMA = 0.05  # of the change against the guess, in units of half a view
 _SHAPE_SIGMA = 0.15
 _MIN_SHAPE_SHARE = 0.6  # of agreeing cells, for a mapping richer than a similarity
 _MIN_STIFF_SHARE = 0.85  # of its agreeing cells that a similarity must keep
 _MAX_STIFF_UNLIKE = 1.25  # and the factor by which they may be less alike
+_SHORT_PX = 0.5  # of the usual level: a step that needs no coarser level before it
 _NEAR_SHARE = 0.015  # of the view: as far a guess may be off where coarse levels are left out
 _SEARCH_SHARE = 0.3  # of the view: how far the search for a shift reaches
 
@@ -87,14 +88,19 @@ def align_near(
 ) -> ViewAlignment:
     """As `align`, from a guess that is right to a few pixels: without the coarser levels.
 
-    An alignment that ends farther from its guess than that is refused as uncertain.
+    At the usual level alone if its steps are short. An alignment that ends farther from its guess
+    than that is refused as uncertain.
     """
     try:
         start = geometry.inverted(guess)
     except np.linalg.LinAlgError:
         return refusal(Verdict.MIRRORED)
-    coarsest = min(USUAL + 1, len(reference.levels.images) - 1, len(view.images) - 1)
-    found = _descended(reference, view, start, hidden, coarsest)
+    fitted = _fit(reference, view, USUAL, start, hidden, most_px=_SHORT_PX)
+    if fitted is not None:
+        found = _stiffened(reference, view, start, fitted, hidden)
+    else:
+        coarsest = min(USUAL + 1, len(reference.levels.images) - 1, len(view.images) - 1)
+        found = _descended(reference, view, start, hidden, coarsest)
     if found.reference_from_view is None:
         return found
     corners = geometry.image_quad(view.size_wh)
@@ -213,8 +219,12 @@ def _fit(
     start: Matrix,
     hidden: Sequence[Points],
     basis: Doubles | None = None,
+    most_px: float = np.inf,
 ) -> Fitted | None:
-    """Gauss-Newton at one level from ``start`` (view_from_reference), or None."""
+    """Gauss-Newton at one level from ``start`` (view_from_reference), or None.
+
+    None also if a step is longer than ``most_px``, in pixels of the level.
+    """
     values = view.high_passed(level)
     to_reference, to_view = reference.levels.level_from_view(level), view.level_from_view(level)
     mapping = to_view @ start @ geometry.inverted(to_reference)
@@ -237,7 +247,7 @@ def _fit(
         gradient = (weighted @ residual).astype(np.float64) - prior @ change
         step = solved(normal, gradient)
         most = np.inf if step is None else float(np.abs(step).max())
-        if step is None or not most < 0.5:
+        if step is None or not most < 0.5 or most * unit_px > most_px:
             return None
         change += step
         unit_step = step_matrix(basis @ step)

@@ -6,7 +6,7 @@ point pairs on which the verdict rests.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import cv2
@@ -92,32 +92,37 @@ def judged(reference: ReferenceView, view: ViewLevels, fitted: Fitted) -> ViewAl
     agreeing = cells.is_agreeing
     shifts = cells.shifts_px[agreeing]
     rmse_px = float(np.sqrt(np.mean(shifts**2))) * view_px if len(shifts) else float("nan")
-    found = ViewAlignment(
-        Verdict.OK,
-        None,
+    verdict = _support_verdict(cells, view_points, view.size_wh)
+    reference_from_view, sigma_px = None, float("inf")
+    if verdict is Verdict.OK:
+        verdict, reference_from_view, sigma_px = _placed(reference, view, fitted)
+    return ViewAlignment(
+        verdict,
+        reference_from_view,
         reference_points,
         view_points,
         agreeing,
         rmse_px,
         cells.correlation,
-        sharpness=cells.sharpness,
+        sigma_px,
+        cells.sharpness,
     )
-    verdict = _support_verdict(found, view)
-    if verdict is not Verdict.OK:
-        return replace(found, verdict=verdict)
+
+
+def _placed(
+    reference: ReferenceView, view: ViewLevels, fitted: Fitted
+) -> tuple[Verdict, Matrix | None, float]:
+    """The verdict on the mapping, reference_from_view if it is OK, and the corners' sigma."""
     try:
         reference_from_view = geometry.inverted(fitted.view_from_reference)
     except np.linalg.LinAlgError:
-        return replace(found, verdict=Verdict.MIRRORED)
+        return Verdict.MIRRORED, None, float("inf")
     sigma_px = _corner_sigma_px(reference, fitted, reference_from_view, view.size_wh)
-    found = replace(found, corner_sigma_px=sigma_px)
     verdict = judge_mapping(reference_from_view, geometry.image_quad(view.size_wh))
     is_certain = fitted.is_settled and sigma_px <= _MAX_CORNER_SIGMA_PX
     if verdict is Verdict.OK and not is_certain:
         verdict = Verdict.UNCERTAIN
-    if verdict is not Verdict.OK:
-        return replace(found, verdict=verdict)
-    return replace(found, reference_from_view=reference_from_view)
+    return verdict, reference_from_view if verdict is Verdict.OK else None, sigma_px
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,12 +144,20 @@ def _cells(fitted: Fitted, max_shift_px: float) -> _Cells:
     gx, gy = pixels.jacobian[2] * unit, pixels.jacobian[5] * unit
     r = fitted.residual
     x, y, one = pixels.points
-    terms = np.stack(
-        [
-            *(one, x, y, wanted, got, wanted * wanted, got * got, wanted * got),
-            *(gx * gx, gy * gy, gx * gy, gx * r, gy * r),
-        ]
+    terms = np.empty((13, len(wanted)), np.float32)
+    terms[:5] = one, x, y, wanted, got
+    pairs = (
+        (wanted, wanted),
+        (got, got),
+        (wanted, got),
+        (gx, gx),
+        (gy, gy),
+        (gx, gy),
+        (gx, r),
+        (gy, r),
     )
+    for row, (left, right) in enumerate(pairs, start=5):
+        np.multiply(left, right, out=terms[row])
     sums = np.add.reduceat(terms, starts, axis=1).astype(np.float64)
     n, sum_x, sum_y, w, g, ww, gg, wg, xx, yy, xy, rx, ry = sums
     covariance = wg / n - w * g / n**2
@@ -165,17 +178,18 @@ def _cells(fitted: Fitted, max_shift_px: float) -> _Cells:
     return _Cells(middles[shown], shift[shown], agreeing[shown], together, ratio)
 
 
-def _support_verdict(found: ViewAlignment, view: ViewLevels) -> Verdict:
-    shown = len(found.is_inlier)
+def _support_verdict(cells: _Cells, view_points: Points, size_wh: Size) -> Verdict:
+    """Do enough of the cells agree, in enough of the view? ``view_points`` (M, 2): their places."""
+    shown, agreeing = len(cells.is_agreeing), int(np.count_nonzero(cells.is_agreeing))
     if shown < _MIN_CELLS:
         return Verdict.TOO_FEW_FEATURES
-    if found.inliers < max(_MIN_CELLS, _MIN_AGREEING_SHARE * shown):
+    if agreeing < max(_MIN_CELLS, _MIN_AGREEING_SHARE * shown):
         return Verdict.TOO_FEW_INLIERS
-    hull = cv2.convexHull(found.view_points[found.is_inlier])
-    share = float(cv2.contourArea(hull)) / (view.size_wh[0] * view.size_wh[1])
+    hull = cv2.convexHull(view_points[cells.is_agreeing])
+    share = float(cv2.contourArea(hull)) / (size_wh[0] * size_wh[1])
     if share < _MIN_SPREAD_SHARE:
         return Verdict.NOT_SPREAD
-    if not found.correlation >= _MIN_CORRELATION:
+    if not cells.correlation >= _MIN_CORRELATION:
         return Verdict.LOW_CORRELATION
     return Verdict.OK
 
@@ -189,11 +203,10 @@ def _corner_sigma_px(
     unit = geometry.transform_points(to_unit, corners).astype(np.float64)
     if not np.isfinite(unit).all():
         return float("inf")
-    rows_x, rows_y = motion_rows(unit).reshape(4, 2, 8).transpose(1, 0, 2)
+    rows = motion_rows(unit) @ fitted.basis
     try:
-        covariance = fitted.basis @ np.linalg.inv(fitted.normal) @ fitted.basis.T
+        variances = np.sum(rows @ np.linalg.inv(fitted.normal) * rows, axis=1)
     except np.linalg.LinAlgError:
         return float("inf")
-    variance = np.sum(rows_x @ covariance * rows_x + rows_y @ covariance * rows_y, axis=1)
-    worst = float(np.sqrt(max(float(np.max(variance)), 0.0)))
+    worst = float(np.sqrt(max(float(variances.reshape(4, 2).sum(axis=1).max()), 0.0)))
     return float(_CORRELATED * worst / to_unit[0, 0])

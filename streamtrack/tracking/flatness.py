@@ -11,14 +11,12 @@ them: what hides or blurs a plane changes how its points look.
 
 from __future__ import annotations
 
-from math import isnan
-
-import numpy as np
+from math import isnan, sqrt
 
 from streamtrack import geometry
-from streamtrack.fitting import fit, transfer_errors
+from streamtrack.fitting import similarity_misfit_px
 from streamtrack.tracking.alignment import CLEAR
-from streamtrack.types import Matrix, Model, Points
+from streamtrack.types import Matrix, Points
 
 _FLAT_IF = ((0.95, 0.01), (0.85, 0.03))  # share of points that agree, at a slant
 _FRAMES = 5  # like that
@@ -89,5 +87,4 @@ class Flatness:
 def slant(pose: Matrix, quad: Points) -> float:
     """How far (RMS) the quad's corners in the frame are from any similarity, against its size."""
     seen = geometry.transform_points(pose, quad)
-    errors = transfer_errors(fit(Model.SIMILARITY, quad, seen), quad, seen)
-    return float(np.sqrt(np.mean(errors**2) / abs(geometry.signed_area(seen))))
+    return similarity_misfit_px(quad, seen) / sqrt(abs(geometry.signed_area(seen)))

@@ -41,10 +41,9 @@ def footprint(
     x0, y0, x1, y1 = (int(np.floor(v / cell_px)) for v in geometry.bounding_box(quad))
     x = (np.arange(x0, x1 + 1) + 0.5) * cell_px
     y = ((np.arange(y0, y1 + 1) + 0.5) * cell_px)[:, None]
-    corners = quad.tolist()
-    seen = np.ones((len(y), len(x)), np.bool_)
-    for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
-        seen &= (bx - ax) * (y - ay) - (by - ay) * (x - ax) >= 0  # clockwise: inside is right
+    ax, ay = quad.astype(np.float64).T[:, :, None, None]
+    along_x, along_y = np.roll(ax, -1, axis=0) - ax, np.roll(ay, -1, axis=0) - ay
+    seen = (along_x * (y - ay) >= along_y * (x - ax)).all(axis=0)  # clockwise: inside is right
     for outline in hidden:
         there = geometry.transform_points(world_from_frame, outline) / cell_px
         polygon = np.rint(np.clip(there - (x0 + 0.5, y0 + 0.5), -1e4, 1e4)).astype(np.int32)

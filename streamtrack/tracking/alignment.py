@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import inf
 
 import cv2
 import numpy as np
@@ -92,9 +93,13 @@ def patch_for(template: Template, frame_from_template: Matrix) -> int:
 
 def points_in_view(view: FrameView, patch: Patch, pose: Matrix) -> Mask:
     """Which of the patch's points (N,) a pose (frame_from_template) puts inside the frame."""
-    in_frame = geometry.transform_points(pose, patch.template_points)
     width, height = view.size_wh
     reach = _REACH_PX * patch.frame_px(pose)
+    frame_from_patch = pose @ patch.template_from_patch
+    x0, y0, x1, y1 = _reach_of(frame_from_patch, geometry.image_quad(patch.size_wh).tolist())
+    if x0 >= reach and y0 >= reach and x1 < width - reach and y1 < height - reach:
+        return np.ones(len(patch.points), np.bool_)
+    in_frame = geometry.transform_points(pose, patch.template_points)
     visible: Mask = (
         (in_frame[:, 0] >= reach)
         & (in_frame[:, 1] >= reach)
@@ -102,6 +107,17 @@ def points_in_view(view: FrameView, patch: Patch, pose: Matrix) -> Mask:
         & (in_frame[:, 1] < height - reach)
     )
     return visible
+
+
+def _reach_of(b_from_a: Matrix, quad: list[list[float]]) -> tuple[float, float, float, float]:
+    """The box (x0, y0, x1, y1) in b around all inside a quad of a; all of b across the horizon."""
+    (a, b, c), (d, e, f), (g, h, i) = b_from_a.tolist()
+    depths = [g * x + h * y + i for x, y in quad]
+    if not min(depths) > 0:
+        return -inf, -inf, inf, inf
+    x = [(a * x + b * y + c) / depth for (x, y), depth in zip(quad, depths, strict=True)]
+    y = [(d * x + e * y + f) / depth for (x, y), depth in zip(quad, depths, strict=True)]
+    return min(x), min(y), max(x), max(y)
 
 
 def surroundings(patch: Patch, rows: Mask) -> Mask:

@@ -276,7 +276,8 @@ def _detect_harris(grey: Image, threshold: float) -> Corners:
     is_peak &= cornerness > threshold
     is_peak[[0, -1], :] = False
     is_peak[:, [0, -1]] = False
-    row, column = np.nonzero(is_peak)
+    # `np.nonzero` of two dimensions is eight times as slow.
+    row, column = np.divmod(np.flatnonzero(is_peak), is_peak.shape[1])
     return _parabola_peaks(cornerness, row, column), cornerness[row, column]
 
 

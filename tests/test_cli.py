@@ -327,6 +327,14 @@ def test_interrupt_closes_all_outputs(tmp_path: Path, target: str, number: int) 
     assert RrdReader(tmp_path / "r.rrd").store() is not None
 
 
+@pytest.mark.parametrize("arguments", [(), ("bench",)])
+def test_without_a_command_the_help_is_shown(
+    arguments: tuple[str, ...], run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(*arguments) == 2
+    assert capsys.readouterr().err.startswith("Usage:")
+
+
 def test_interrupted_while_it_loads_it_ends_without_a_word() -> None:
     code = """
 import os, signal, sys

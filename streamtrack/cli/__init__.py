@@ -111,10 +111,11 @@ def exit_on_error(run: Callable[[], Any]) -> None:
         if isinstance(result, int):
             sys.exit(result)
     except TyperException as error:
-        if not sys.argv[1:]:
-            sys.stderr.write(f"{error.format_message()}\n")  # the help
+        message = error.format_message()
+        if message.startswith("Usage:"):  # the help, of the program or of `bench`
+            sys.stderr.write(f"{message}\n")
             sys.exit(error.exit_code)
-        _fail(f"{error.format_message().rstrip('.')}; see streamtrack --help", error.exit_code)
+        _fail(f"{message.rstrip('.')}; see streamtrack --help", error.exit_code)
     except UsageError as error:
         _fail(error, 2)
     except StreamtrackError as error:

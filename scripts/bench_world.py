@@ -48,6 +48,7 @@ SCENES = ("sweep", "drive", "pan", "crowd", "strays", "tripod")
 _MARGIN = 480
 _NOISE = 2.0
 _WARM_UP = 10
+_HALTING_PACE = 9.0
 
 
 def texture(seed: int, size_wh: tuple[int, int], contrast: float = 14.0) -> Image:
@@ -70,13 +71,18 @@ def texture(seed: int, size_wh: tuple[int, int], contrast: float = 14.0) -> Imag
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """A textured rectangle at an offset from the view's middle, or on the ground if it stands."""
+    """A textured rectangle at an offset from the view's middle, or on the ground if it stands.
+
+    With ``halt`` (first and last frame) it comes along the ground at 9 px a frame, stands between
+    these at the offset from the first view's middle, and goes on. ``picture`` is BGR, or BGRA.
+    """
 
     name: str
     picture: Image
     offset: tuple[float, float]
     stands: bool
     phase: float = 0.0
+    halt: tuple[int, int] | None = None
 
 
 @dataclass(slots=True)
@@ -117,7 +123,9 @@ class Scene:
     def ground_from_board(self, board: Board, n: float) -> Matrix:
         height, width = board.picture.shape[:2]
         x, y = board.offset
-        if board.stands:
+        if board.halt is not None:
+            x += _HALTING_PACE * (min(0.0, n - board.halt[0]) + max(0.0, n - board.halt[1]))
+        if board.stands or board.halt is not None:
             place = self.ground_from_frame(0) @ [319.5 + x, 239.5 + y, 1]
             angle = 0.0
         else:
@@ -157,8 +165,10 @@ class Scene:
         picture = cv2.warpPerspective(self.ground, frame_from_ground, SIZE, flags=cv2.INTER_CUBIC)
         for board in self.boards:
             matrix = self.frame_from_board(board, n)
-            warped = cv2.warpPerspective(board.picture, matrix, SIZE, flags=cv2.INTER_CUBIC)
+            shown = np.ascontiguousarray(board.picture[..., :3])
+            warped = cv2.warpPerspective(shown, matrix, SIZE, flags=cv2.INTER_CUBIC)
             full = np.full(board.picture.shape[:2], 255, np.uint8)
+            full = full if board.picture.shape[2] == 3 else board.picture[..., 3]
             alpha = cv2.warpPerspective(full, matrix, SIZE)[..., None].astype(np.float32) / 255
             picture = (picture + (warped.astype(np.float32) - picture) * alpha).astype(np.float32)
         noise = rng.standard_normal(picture.shape, np.float32) * np.float32(_NOISE)

@@ -169,6 +169,32 @@ def test_a_textured_thing_that_stays_for_half_of_the_time_is_not_the_ground(
     assert np.mean(cv2.blur(error, (5, 5))[80:150, 120:200] > 25) < 0.08
 
 
+def test_what_goes_along_with_the_camera_is_not_the_ground(
+    tmp_path: Path, make_picture: MakePicture
+) -> None:
+    """Things that nobody named hide half of the rows for half of the time."""
+    size = 320, 240
+    land = cv2.cvtColor(make_picture(13, (1100, 240)), cv2.COLOR_GRAY2BGR)
+    things = [
+        cv2.cvtColor(make_picture(14 + k, (60, 110)), cv2.COLOR_GRAY2BGR) // 2
+        + np.array(tint, np.uint8)
+        for k, tint in enumerate([(110, 30, 0), (0, 110, 30), (30, 0, 110)])
+    ]
+    with StreamMosaic(settings()) as mosaic:
+        for number in range(120):
+            x = 6 * number
+            image = land[:, x : x + size[0]].copy()
+            for left, thing in zip((20, 130, 240), things, strict=True):
+                place = left + int(10 * np.sin(number / 9 + left))
+                image[60:170, place : place + 60] = thing
+            assert mosaic.add(Frame(number, number / 30, image), at(x, 0)) == ""
+        mosaic.finish(tmp_path / "m.png")
+    picture = read(tmp_path / "m.png")[..., :3]
+    error = cv2.absdiff(picture, land[:, : picture.shape[1]]).max(axis=2)
+    # At both ends there are too few frames that show what lies behind.
+    assert np.mean(cv2.blur(error, (5, 5))[:, 160:-160] > 25) < 0.1
+
+
 def test_targets_are_not_painted(tmp_path: Path, make_picture: MakePicture) -> None:
     """Not even one that is in every frame, as long as the camera or the target moves."""
     land = make_picture(13, (400, 120))

@@ -22,10 +22,12 @@ import numpy as np
 from streamtrack import geometry
 from streamtrack.closing import Closing
 from streamtrack.errors import OutputError
+from streamtrack.mosaic import gains
 from streamtrack.mosaic.spill import SpillFile
 from streamtrack.mosaic.stream import painting
 from streamtrack.mosaic.stream.canvas import Canvas
 from streamtrack.mosaic.stream.export import Exported, export
+from streamtrack.mosaic.stream.movers import Movers
 from streamtrack.mosaic.stream.render import Renderer
 from streamtrack.mosaic.stream.rerender import Rerenderer
 from streamtrack.mosaic.stream.tiles import TILE, Box
@@ -139,8 +141,10 @@ class StreamMosaic(Closing):
         reason = pose.reason or "its pose is not known"
         if world_from_frame is not None:
             reason = self._place(frame, world_from_frame, painting.target_quads(tracks))
-        elif self._waiting is not None:
+        else:
             self._keep_waiting()
+            if self._store is not None:
+                self._movers.forget()
         if reason:
             self.figures.refused[reason] += 1
         self._work()
@@ -158,16 +162,18 @@ class StreamMosaic(Closing):
         self._outline = geometry.transform_points(world_from_frame, corners)
         self._near = geometry.transform_points(canvas_from_frame, corners).mean(axis=0)
         need = store.need(world_from_frame, frame.size_wh, self._moment, quads)
+        self._movers.follow(frame, world_from_frame)
+        now = _Waiting(frame, world_from_frame, quads, self._moment, need.new)
         waiting = self._waiting
         if need.new >= NEW_SHARE or need.wants_sample or not len(store):
             self._waiting = None
             if waiting is not None and need.new < waiting.new:
                 self._keep(waiting)
-            self._keep(_Waiting(frame, world_from_frame, quads, self._moment, need.new))
+            self._keep(now)
         elif waiting is not None and need.new < 0.5 * waiting.new:
             self._keep_waiting()
         elif need.new > max(_LEAST_SHARE, 0.0 if waiting is None else waiting.new):
-            self._waiting = _Waiting(frame, world_from_frame, quads, self._moment, need.new)
+            self._waiting = now
         return ""
 
     def _begin(self, frame: Frame) -> None:
@@ -177,6 +183,7 @@ class StreamMosaic(Closing):
         self._store = ViewStore(
             frame.size_wh, self._scale, int(self._budget * _VIEW_SHARE), self._spill
         )
+        self._movers = Movers(self._store, self._scale / painting.SHRINK)
         self._renderer = Renderer(self._store, self._scale, int(self._budget * _CACHE_SHARE))
         self._rerender = Rerenderer(self._canvas, self._store, self._renderer)
         self._near = np.zeros(2, np.float32)
@@ -198,6 +205,7 @@ class StreamMosaic(Closing):
         world_from_frame = self._known_pose(given.frame.index, given.world_from_frame)
         try:
             view = store.add(given.frame, world_from_frame, given.quads, given.moment)
+            self._movers.judge(view)
             if self._graph is not None:
                 self._graph.keep(given.frame.index)
             self._paint(given.frame.image, view)
@@ -215,6 +223,12 @@ class StreamMosaic(Closing):
         canvas_from_frame = self._renderer.canvas_from_frame(view)
         box = painting.box_of(canvas_from_frame, view.size_wh)
         small = painting.shrunk(image, view.quads, canvas_from_frame, self._scale, box)
+        if view.doubts is not None:
+            doubts_from_frame = gains.thumb_matrix(view.doubts, view.size_wh)
+            from_doubts = canvas_from_frame @ geometry.inverted(doubts_from_frame)
+            small_from_doubts = geometry.scaling(1 / painting.SHRINK) @ from_doubts
+            x0, y0, x1, y1 = (side // painting.SHRINK for side in box)
+            small = painting.doubted(small, view.doubts, small_from_doubts, (x0, y0, x1, y1))
         small = painting.with_gain(small, view.log_gain)
         seen = painting.compared(box, painting.quartered(self._canvas.read(box)), small)
         for part in seen.parts():

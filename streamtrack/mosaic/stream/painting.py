@@ -34,6 +34,7 @@ FEATHER = 6
 SHRINK = 4
 """Frame and canvas are compared so many times smaller."""
 
+_DOUBTED = np.where(np.arange(256) > 0, np.maximum(np.arange(256) >> 5, 1), 0).astype(np.uint8)
 _EDGE_PX = 12.0
 _LEAST_AREA = 16.0
 _TARGET_MARGIN = 0.08
@@ -140,6 +141,18 @@ def warped(
     return np.asarray(cv2.insertChannel(weight, result, 3), np.uint8)
 
 
+def doubted(pixels: Image, doubts: Image, canvas_from_doubts: Matrix, box: Box) -> Image:
+    """BGRW pixels in a box of the canvas, lighter than `LEAST_WEIGHT` where ``doubts`` are 255.
+
+    Such a pixel is shown only where no other is.
+    """
+    into_box = geometry.translation(-box[0], -box[1]) @ canvas_from_doubts
+    there = cv2.warpPerspective(doubts, into_box, (pixels.shape[1], pixels.shape[0]))
+    weight = cv2.extractChannel(pixels, 3)
+    cv2.copyTo(cv2.LUT(weight, _DOUBTED), cv2.inRange(there, 128, 255), weight)
+    return np.asarray(cv2.insertChannel(weight, pixels.copy(), 3), np.uint8)
+
+
 def shrunk(
     image: Image, quads: Sequence[Points], canvas_from_frame: Matrix, scale: float, box: Box
 ) -> Image:
@@ -194,25 +207,35 @@ def _resized(pixels: Image, size_wh: Size) -> Image:
 def disagreement(small_old: Image, small_new: Image) -> Image:
     """Where two BGRW pictures of one place, at a quarter of their size, show different things.
 
-    255 where the colours, averaged over about 12 px, differ by more than noise and the structure
-    itself (a quarter of its local range: edges that are half a pixel off are no objects) explain.
+    255 there: where they are `unlike`, and in gaps, for a thing is as bright as what it hides here
+    and there.
+    """
+    found = unlike(small_old, small_new, _NOISE_LEVELS)
+    if cv2.countNonZero(found):
+        found = np.asarray(cv2.morphologyEx(found, cv2.MORPH_CLOSE, _KERNEL_9), np.uint8)
+        found = np.asarray(cv2.dilate(found, _KERNEL_5), np.uint8)
+    return found
+
+
+def unlike(small_old: Image, small_new: Image, levels: float) -> Image:
+    """Where two BGRW pictures of one place, at a quarter of their size, have other colours.
+
+    255 where these, averaged over about 12 px, differ by more than noise (``levels``) and the
+    structure itself (a quarter of its local range: edges that are half a pixel off are no objects)
+    explain.
     """
     both = cv2.min(cv2.extractChannel(small_old, 3), cv2.extractChannel(small_new, 3))
     b, g, r, _ = cv2.split(cv2.blur(cv2.absdiff(small_old, small_new), (3, 3)))
     worst = cv2.max(cv2.max(b, g), r)
     worst = cv2.min(worst, cv2.threshold(both, 0, 255, cv2.THRESH_BINARY)[1])
-    found = cv2.inRange(worst, _NOISE_LEVELS, 255)
+    found = cv2.inRange(worst, levels, 255)
     if not cv2.countNonZero(found):
         return np.asarray(found, np.uint8)
     grey = cv2.cvtColor(small_old, cv2.COLOR_BGRA2GRAY)
     spread = cv2.morphologyEx(grey, cv2.MORPH_GRADIENT, _KERNEL_3)
-    excess = cv2.subtract(worst, cv2.convertScaleAbs(spread, alpha=0.25, beta=_NOISE_LEVELS))
+    excess = cv2.subtract(worst, cv2.convertScaleAbs(spread, alpha=0.25, beta=levels))
     found = cv2.threshold(excess, 0, 255, cv2.THRESH_BINARY)[1]
-    found = cv2.morphologyEx(found, cv2.MORPH_OPEN, _KERNEL_3)
-    if cv2.countNonZero(found):
-        # A thing is as bright as what it hides here and there: close the gaps in it.
-        found = cv2.dilate(cv2.morphologyEx(found, cv2.MORPH_CLOSE, _KERNEL_9), _KERNEL_5)
-    return np.asarray(found, np.uint8)
+    return np.asarray(cv2.morphologyEx(found, cv2.MORPH_OPEN, _KERNEL_3), np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -256,10 +279,14 @@ def compared(box: Box, small_old: Image, small_new: Image) -> Comparison:
 
     The sides of the box are multiples of 4.
     """
-    is_empty = cv2.inRange(cv2.extractChannel(small_old, 3), 0, 0)
-    is_shown = cv2.inRange(cv2.extractChannel(small_new, 3), 1, 255)
-    new = cv2.dilate(cv2.bitwise_and(is_empty, is_shown), _KERNEL_9)
-    return Comparison(box, np.asarray(new, np.uint8), disagreement(small_old, small_new))
+    old, now = cv2.extractChannel(small_old, 3), cv2.extractChannel(small_new, 3)
+    is_better = cv2.bitwise_and(
+        cv2.inRange(old, 1, LEAST_WEIGHT - 1), cv2.inRange(now, LEAST_WEIGHT, 255)
+    )
+    is_first = cv2.bitwise_and(cv2.inRange(old, 0, 0), cv2.inRange(now, 1, 255))
+    new = cv2.dilate(cv2.bitwise_or(is_first, is_better), _KERNEL_9)
+    differs = cv2.subtract(disagreement(small_old, small_new), is_better)
+    return Comparison(box, np.asarray(new, np.uint8), np.asarray(differs, np.uint8))
 
 
 def paint(old: Image, new: Image, differs: Image) -> Image:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from streamtrack import geometry
+from streamtrack.mosaic import gains
 from streamtrack.mosaic.stream import painting
 from streamtrack.mosaic.stream.consensus import Chooser
 from streamtrack.mosaic.stream.tiles import Box, common_box
@@ -98,6 +99,10 @@ class Renderer:
             )
             part[..., :3] = kept[..., :3]
         into = slice(y0 - box[1], y1 - box[1]), slice(x0 - box[0], x1 - box[0])
+        if view.doubts is not None:
+            doubts_from_frame = gains.thumb_matrix(view.doubts, view.size_wh)
+            from_doubts = self.canvas_from_frame(view) @ geometry.inverted(doubts_from_frame)
+            part = painting.doubted(part, view.doubts, from_doubts, (x0, y0, x1, y1))
         result[into] = painting.with_gain(part, view.log_gain)
         return result
 

@@ -32,7 +32,8 @@ _LEAST_LEFT = 3
 _CROWDED_SHARE = 0.7
 _CELLS_A_SIDE = 20
 _MIN_GAP = 4
-_WANTED_SHARE = 0.5
+_WANTED_SHARE, _UNSURE_SHARE = 0.5, 0.1
+_SURE, _MOST_RESTLESS = 2, 8  # samples at rest that will do; samples after which no more are tried
 _JPEG_QUALITY = 95
 _NEIGHBOURS = 4
 
@@ -42,7 +43,8 @@ class View:
     """One frame that is kept.
 
     ``number`` counts kept views from 0, ``frame`` is the index in the source and ``moment`` the
-    frame's place among those the mosaic was given. ``thumb`` is BGRW, small.
+    frame's place among those the mosaic was given. ``thumb`` is BGRW, small. ``doubts``
+    (of any size) are 255 where it may not show the ground; the cells of these are ``restless``.
     """
 
     number: int
@@ -55,6 +57,8 @@ class View:
     world_from_frame: Matrix
     cells: Footprint
     log_gain: gains.LogGain
+    doubts: Image | None = None
+    restless: Footprint | None = None
     edges: list[gains.GainEdge] = field(default_factory=list)
 
     @property
@@ -68,14 +72,19 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Need:
-    """What a frame would add: shares (0..1) of the cells it sees."""
+    """What a frame would add: shares (0..1) of the cells it sees.
+
+    ``new`` ones were never seen, ``wanted`` ones want another sample; in ``unsure`` ones something
+    moved in nearly all samples so far.
+    """
 
     new: float
     wanted: float
+    unsure: float
 
     @property
     def wants_sample(self) -> bool:
-        return self.wanted > _WANTED_SHARE
+        return self.wanted > _WANTED_SHARE or self.unsure > _UNSURE_SHARE
 
 
 class ViewStore:
@@ -93,6 +102,7 @@ class ViewStore:
         self._bytes = 0
         self._next = 0
         self._counts, self._last, self._first = CellGrid(), CellGrid(), CellGrid()
+        self._restless = CellGrid()
         self._by_tile: dict[TileKey, set[int]] = {}
 
     def __len__(self) -> int:
@@ -110,12 +120,19 @@ class ViewStore:
         age = moment + 1 - self._first.read(cells)[seen]
         gap = np.maximum(_MIN_GAP, age // _wanted_samples(age))
         wanted = (counts > 0) & (since_last >= gap)
+        restless = self._restless.read(cells)[seen]
+        unsure = (restless > 0) & (counts < restless + _SURE) & (restless <= _MOST_RESTLESS)
+        unsure &= since_last >= _MIN_GAP
         return Need(
-            float(np.count_nonzero(counts == 0)) / total, float(np.count_nonzero(wanted)) / total
+            *(float(np.count_nonzero(cell)) / total for cell in (counts == 0, wanted, unsure))
         )
 
     def add(
-        self, frame: Frame, world_from_frame: Matrix, quads: tuple[Points, ...], moment: int
+        self,
+        frame: Frame,
+        world_from_frame: Matrix,
+        quads: tuple[Points, ...],
+        moment: int,
     ) -> View:
         """Keep a frame. Raises OutputError if its picture finds room nowhere."""
         cells = footprint(world_from_frame, frame.size_wh, self._cell_px, quads)
@@ -139,6 +156,12 @@ class ViewStore:
         self._first.write(cells, _first_moments(self._first.read(cells), moment + 1))
         self._last.write(cells, np.full(cells.seen.shape, moment + 1, np.int32))
         return view
+
+    def doubt(self, view: View, doubts: Image) -> None:
+        """Say where a kept view may not show the ground, 255 there (h, w), in place of before."""
+        self._leave(view)
+        view.doubts = doubts
+        self._enter(view)
 
     def image_of(self, view: View) -> Image:
         """A view's picture, decoded, BGR or grey as it came. Raises OutputError."""
@@ -209,13 +232,18 @@ class ViewStore:
         return min(spare, key=gap, default=None)
 
     def _can_spare(self, view: View, now: int) -> bool:
-        counts = self._counts.read(view.cells)[view.cells.seen]
+        seen = view.cells.seen
+        counts = self._counts.read(view.cells)[seen]
         crowded = np.count_nonzero(counts > self._wanted(view.cells, now))
-        return bool((counts > _LEAST_LEFT).all() and crowded >= _CROWDED_SHARE * len(counts))
+        left = counts - self._restless.read(view.cells)[seen]
+        if view.restless is not None:
+            left = left[~view.restless.seen[seen]]
+        return bool((left > _LEAST_LEFT).all() and crowded >= _CROWDED_SHARE * len(counts))
 
     def _wanted(self, cells: Footprint, now: int) -> Values:
         """How many samples the cells that a footprint sees want at a moment, (N,)."""
-        return _wanted_samples(now + 1 - self._first.read(cells)[cells.seen])
+        restless = np.minimum(self._restless.read(cells)[cells.seen], _MOST_RESTLESS)
+        return _wanted_samples(now + 1 - self._first.read(cells)[cells.seen]) + restless
 
     def neighbours(self, view: View) -> list[View]:
         """The other views that may overlap it."""
@@ -255,13 +283,30 @@ class ViewStore:
 
     def _enter(self, view: View) -> None:
         self._counts.add(view.cells, 1)
+        if view.doubts is not None:
+            view.restless = self._cells_of(view, view.doubts)
+            self._restless.add(view.restless, 1)
         for key in self.tiles_of(view):
             self._by_tile.setdefault(key, set()).add(view.number)
 
     def _leave(self, view: View) -> None:
         self._counts.add(view.cells, -1)
+        if view.restless is not None:
+            self._restless.add(view.restless, -1)
         for key in self.tiles_of(view):
             self._by_tile[key].discard(view.number)
+
+    def _cells_of(self, view: View, mask: Image) -> Footprint:
+        """The cells that a view sees in its mask (h, w)."""
+        cells = view.cells
+        mask_from_frame = gains.thumb_matrix(mask, view.size_wh)
+        world_from_mask = view.world_from_frame @ geometry.inverted(mask_from_frame)
+        cells_from_world = geometry.translation(-cells.x - 0.5, -cells.y - 0.5) @ geometry.scaling(
+            1 / self._cell_px
+        )
+        size_wh = cells.seen.shape[1], cells.seen.shape[0]
+        found = cv2.warpPerspective(mask, cells_from_world @ world_from_mask, size_wh)
+        return Footprint(cells.x, cells.y, cells.seen & (found > 127))
 
 
 def _wanted_samples(age: Values) -> Values:

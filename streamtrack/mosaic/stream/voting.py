@@ -1,7 +1,9 @@
 """Which of several samples of a place to believe where they disagree.
 
-The sample that most others agree with leads; of equals, the oldest. Where a vote is close (two
-samples that disagree, or a thing that stood there for about half of the time) the outlines tell:
+The sample that most others agree with leads; of equals, the oldest. A sample in which something
+moved has hardly a vote. What was seen before and after another thing stood there is the ground,
+though that stood for longer. Where that is not known and a vote is close (two samples that
+disagree, or a thing that stood there for about half of the time) the outlines tell:
 a thing that lies on the ground ends at its outline, in colour and in edges, and the ground goes on.
 After the test for removed objects in video surveillance (Connell et al., "Detection and tracking in
 the IBM PeopleVision system", ICME 2004), made pairwise.
@@ -17,10 +19,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from streamtrack.mosaic.stream.painting import LEAST_WEIGHT
 from streamtrack.types import Image, Mask
 
 _CALM = 9
+_DOUBTED_VOTE = 0.03  # of what moved when it was seen
 _CLOSE_VOTE, _CLOSE_BY = 0.6, 3.0  # votes of the leader's, or fewer by so many: of many, more
+_VISITED = 0.3  # votes of the leader's that suffice to what was seen before and after it
 _MOST_SPAN = 4.0
 _CLEARLY, _VERY_CLEARLY = 1.15, 1.4
 _AROUND_LEVELS = 16.0
@@ -58,18 +63,20 @@ def vote(samples: Image, differs: Differs, moments: Sequence[int]) -> Votes:
     A sample's vote counts for the time between its neighbours.
     """
     covered = samples[..., 3] > 0
-    spans = _spans(moments)
-    times = np.tensordot(spans, covered.astype(np.float32), axes=1)
+    votes = _spans(moments)[:, None, None] * _trust(samples[..., 3])
+    times = votes.sum(axis=0)
     support = np.where(covered, times[None], 0).astype(np.float32)
     contested = np.zeros(times.shape, np.bool_)
     for (a, b), mask in differs.items():
-        support[a][mask] -= spans[b]
-        support[b][mask] -= spans[a]
+        support[a][mask] -= votes[b][mask]
+        support[b][mask] -= votes[a][mask]
         contested |= mask
     # Averaged, so that one sample leads in all of a place.
     smooth = np.stack([cv2.blur(votes, (_CALM, _CALM)) for votes in support])
-    smooth = np.where(covered, smooth, 0.0).astype(np.float32)
+    smooth = (smooth * _trust(samples[..., 3])).astype(np.float32)
     leader = np.argmax(smooth, axis=0)
+    stays = _stays(samples[..., 3] >= LEAST_WEIGHT, differs, moments)
+    _let_lasting_lead(smooth, leader, stays)
     _settle_close_votes(samples, support, leader, differs)
     outliers = [np.zeros(times.shape, np.bool_) for _ in samples]
     for (a, b), mask in differs.items():
@@ -79,6 +86,13 @@ def vote(samples: Image, differs: Differs, moments: Sequence[int]) -> Votes:
         outliers = _with_odd_ones(samples, outliers)
     undecided = contested & (2 * support.max(axis=0) <= 1.001 * times)
     return Votes(outliers, int(np.count_nonzero(contested)), int(np.count_nonzero(undecided)))
+
+
+def _trust(weights: Image) -> Floats:
+    """The share of a vote that samples of such weights have, 0 if they show nothing."""
+    trust = np.where(np.arange(256) < LEAST_WEIGHT, _DOUBTED_VOTE, 1.0).astype(np.float32)
+    trust[0] = 0.0
+    return np.asarray(trust[weights], np.float32)
 
 
 def _with_odd_ones(samples: Image, outliers: list[Mask]) -> list[Mask]:
@@ -121,39 +135,87 @@ def _spans(moments: Sequence[int]) -> Floats:
     return np.asarray(spans / spans.mean(), np.float32)
 
 
+def _stays(
+    shown: Mask, differs: Differs, moments: Sequence[int]
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+    """The first and the last moment (n, h, w) of what each sample shows, as seen in ``shown`` ones.
+
+    Samples show the same where both show something and do not differ.
+    """
+    first = np.broadcast_to(np.asarray(moments, np.int32)[:, None, None], shown.shape).copy()
+    last = first.copy()
+    for b in range(len(shown)):
+        for a in range(b):
+            same = shown[a] & shown[b]
+            if (a, b) in differs:
+                same &= ~differs[a, b]
+            np.minimum(first[b], moments[a], out=first[b], where=same)
+            np.maximum(last[a], moments[b], out=last[a], where=same)
+    return first, last
+
+
+def _let_lasting_lead(
+    smooth: Floats, leader: npt.NDArray[np.intp], stays: Sequence[npt.NDArray[np.int32]]
+) -> None:
+    """Change the leader, in place, where another was there before it and after it."""
+    leading, (first, last) = leader[None], stays
+    votes = np.take_along_axis(smooth, leading, axis=0)
+    lasts = first < np.take_along_axis(first, leading, axis=0)
+    lasts &= last > np.take_along_axis(last, leading, axis=0)
+    lasts &= smooth >= np.float32(_VISITED) * votes
+    for number in np.flatnonzero(lasts.any(axis=(1, 2))).tolist():
+        share = cv2.blur(lasts[number].astype(np.float32), _NEAR)
+        lasts[number] &= share > 0.5
+    rival = np.argmax(np.where(lasts, smooth, -1.0), axis=0)
+    np.copyto(leader, rival, where=lasts.any(axis=0))
+
+
 def _settle_close_votes(
-    samples: Image, support: Floats, leader: npt.NDArray[np.intp], differs: Differs
+    samples: Image,
+    support: Floats,
+    leader: npt.NDArray[np.intp],
+    differs: Differs,
 ) -> None:
     """Change the leader, in place, where another with nearly as many votes shows the ground."""
+    is_sure = samples[..., 3] >= LEAST_WEIGHT
     leads = leader.copy()
+    closeness = max(_CLOSE_VOTE, 1 - _CLOSE_BY / len(samples))
     for first in np.unique(leads).tolist():
         is_first = leads == first
-        rivals = [a + b - first for a, b in differs if first in (a, b)]
-        for rival in sorted(rivals, key=lambda number: -float(support[number][is_first].sum())):
-            mask = differs[min(first, rival), max(first, rival)]
-            seen = mask & (support[first] > 0) & (support[rival] > 0)
+        disputes = {a + b - first: mask for (a, b), mask in differs.items() if first in (a, b)}
+        weight = {
+            rival: float(support[rival][mask & is_first & is_sure[rival]].sum())
+            for rival, mask in disputes.items()
+        }
+        for rival, mask in sorted(disputes.items(), key=lambda item: -weight[item[0]]):
+            seen = (
+                mask
+                & (support[first] > 0)
+                & (support[rival] > _VISITED * support[first])
+                & is_sure[rival]
+            )
             if not (seen & is_first & (leader == first)).any():
                 continue
             pair, votes = (samples[rival], samples[first]), (support[rival], support[first])
             # A thing may have several leaders: a part of it is judged with the whole as well.
             for roi, part in _parts(seen & is_first & (leader == first)):
-                is_close = _is_close(votes, roi, part, len(samples))
+                is_close = _is_close(votes, roi, part, closeness)
                 if is_close and _is_ground(pair[0][roi], pair[1][roi], part, mask[roi], _CLEARLY):
                     leader[roi][part] = rival
             for roi, whole in _parts(seen):
                 led = whole & is_first[roi] & (leader[roi] == first)
-                is_close = led.any() and _is_close(votes, roi, led, len(samples))
+                is_close = led.any() and _is_close(votes, roi, led, closeness)
                 one, other = pair[0][roi], pair[1][roi]
                 if is_close and _is_ground(one, other, whole, mask[roi], _VERY_CLEARLY):
                     leader[roi][led] = rival
 
 
 def _is_close(
-    votes: tuple[Floats, Floats], roi: tuple[slice, slice], inside: Mask, count: int
+    votes: tuple[Floats, Floats], roi: tuple[slice, slice], inside: Mask, share: float
 ) -> bool:
-    """Whether the first of a pair, of so many samples, has nearly as many votes in a part."""
+    """Whether the first of a pair has such a share of the other's votes in a part, or more."""
     one, other = (float(np.median(some[roi][inside])) for some in votes)
-    return one >= max(_CLOSE_VOTE, 1 - _CLOSE_BY / count) * other
+    return one >= share * other
 
 
 def _parts(mask: Mask) -> Iterator[tuple[tuple[slice, slice], Mask]]:

@@ -38,7 +38,7 @@ class Pyramid:
         centre = np.array([size_wh[0] / 2, size_wh[1] / 2])
         picture_px = geometry.local_scale(picture_from_patch, centre)
         octave = max(0, min(_MAX_OCTAVE, round(log2(max(picture_px, 1e-3)))))
-        level = self._level(octave)
+        level = self.level(octave)
         level_from_patch = picture_from_patch
         if octave:
             width, height = self.size_wh
@@ -53,7 +53,7 @@ class Pyramid:
         )
         return np.asarray(warped, np.uint8)
 
-    def _level(self, octave: int) -> Image:
+    def level(self, octave: int) -> Image:
         """The picture halved ``octave`` times."""
         while len(self._levels) <= octave:
             finer = self._levels[-1]

@@ -17,6 +17,8 @@ from streamtrack.auto.followed import Followed, Life
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
 _MAX_COST = 1.7
+_GATE = 0.3  # of the extents of both, that a thing may lie off
+_KNOWN_GATE = 0.18  # of what was seen in the frame before
 _FRAGMENT_INSIDE = 0.7  # of a fragment's area that lies in the predicted box
 _FRAGMENT_SHARE = 0.4  # of the largest of them
 _PARTS_APART = 0.2  # of the reach, between the motions of fragments of one thing
@@ -59,7 +61,7 @@ def found_again(thing: Followed, others: Sequence[Followed], reach_px: float) ->
             continue
         speed = float(np.hypot(*lost.velocity))
         extents = float(np.hypot(*thing.size) + np.hypot(*lost.size))
-        gate_px = 0.3 * extents + reach_px + 0.5 * lost.lost_s * speed
+        gate_px = _GATE * extents + reach_px + 0.5 * lost.lost_s * speed
         off_px = float(np.hypot(*(thing.center - lost.center)))
         color = np.sqrt(max(0.0, 1.0 - float(np.sqrt(thing.colors * lost.colors).sum())))
         apart = float(np.hypot(*(thing.velocity - lost.velocity)))
@@ -82,7 +84,9 @@ def _costs(things: Sequence[Followed], blobs: Sequence[Blob], reach_px: float) -
     is_lost = np.array([thing.life is Life.LOST for thing in things])[:, None]
     is_new = np.array([thing.life is Life.NEW for thing in things])[:, None]
     drift = np.array([0.5 * t.lost_s * float(np.hypot(*t.velocity)) for t in things])[:, None]
-    gate_px = 0.3 * extents + reach_px + np.where(is_lost, drift, 0.0)
+    is_known = ~(is_lost | is_new)
+    gate_px = np.where(is_known, _KNOWN_GATE, _GATE) * extents
+    gate_px += reach_px + np.where(is_lost, drift, 0.0)
     shared = (
         np.sqrt(np.stack([thing.colors for thing in things]))
         @ np.sqrt(np.stack([blob.colors for blob in blobs])).T

@@ -151,25 +151,24 @@ class BackgroundModel:
         belongs to things that are followed.
         """
         image, off, seen, self._mean = self._last
-        is_young = self._age < _KNOWN_AGE
         is_no_ground = moving | protected
-        self._age[is_young & is_no_ground] = 0
+        self._age[(self._age < _KNOWN_AGE) & is_no_ground] = 0
         is_new = seen & (self._age == 0)
         if is_new.any():
-            self._mean[is_new] = image[is_new]
+            cv2.copyTo(image.astype(np.float32), is_new.view(np.uint8), self._mean)
             self._age[is_new & ~is_no_ground] = 1
         matches = seen & ~outstanding.faint & ~is_new
-        rate = np.where(matches, 1 / np.minimum(self._age + 1, _MAX_AGE), 0).astype(np.float32)
+        rate = matches / np.minimum(self._age + 1, np.float32(_MAX_AGE))
         change = cv2.subtract(image, self._mean, dtype=cv2.CV_32F)
-        self._mean += cv2.multiply(change, cv2.merge([rate, rate, rate]))
-        excess = np.minimum(off, 40).astype(np.float32) * np.float32(1.2)
-        restless = outstanding.faint & seen & ~moving & ~protected
+        cv2.accumulateProduct(change, cv2.merge([rate, rate, rate]), self._mean)
+        restless = outstanding.faint & seen & ~is_no_ground
         rate[restless] = _RESTLESS_RATE
-        self._deviation += rate * (excess - self._deviation)
+        excess = np.minimum(off, 40) * np.float32(1.2) - self._deviation
+        cv2.accumulateProduct(excess, rate, self._deviation)
         self._age += matches
         self._candidate_age -= matches & (self._candidate_age > 0)
         self._candidate_age[moving] = 0
-        self._learn_candidates(image, outstanding.faint & seen & ~protected & ~moving)
+        self._learn_candidates(image, restless)
 
     def has_left(self, place: Mask) -> bool:
         """Is a place (h, w) that differs just where something stood that was taken for background?
@@ -284,19 +283,19 @@ class BackgroundModel:
         """The background's mean (h, w, 3) in the light of the frame."""
         if np.mean(known) < 0.2:
             return self._mean
-        mean = cv2.convertScaleAbs(self._mean[::2, ::2])
+        mean = cv2.convertScaleAbs(self._mean[::3, ::3])
         background = np.asarray(cv2.cvtColor(mean, cv2.COLOR_BGR2GRAY), np.uint8)
-        log_gain = _light_change(grey[::2, ::2], background, known[::2, ::2])
+        log_gain = _light_change(grey[::3, ::3], background, known[::3, ::3])
         if log_gain is None or np.abs(log_gain).max() < _LEAST_LOG_GAIN:
             return self._mean
         field = cv2.resize(np.exp(log_gain), self.size_wh, interpolation=cv2.INTER_LINEAR)
-        relit = self._mean * np.asarray(field, np.float32)[:, :, None]
-        return np.asarray(np.minimum(relit, 255.0, out=relit), np.float32)
+        relit = cv2.multiply(self._mean, cv2.merge([field, field, field]))
+        return np.minimum(np.asarray(relit, np.float32), np.float32(255))
 
 
 def _shifted(array: npt.NDArray[_Number], dx: int, dy: int) -> npt.NDArray[_Number]:
     """The array seen ``(dx, dy)`` pixels further on; zero where it did not reach."""
-    moved = np.zeros_like(array)
+    moved = np.zeros(array.shape, array.dtype)  # pages of zeros cost less than `zeros_like`
     height, width = array.shape[:2]
     if abs(dx) >= width or abs(dy) >= height:
         return moved
@@ -325,12 +324,12 @@ def _light_change(grey: Image, background: Image, known: Mask) -> Floats | None:
     change = _LOG[grey[:height, :width]] - _LOG[background[:height, :width]]
     change[~known[:height, :width]] = np.nan
     blocks = change.reshape(rows, height // rows, columns, width // columns)
-    blocks = blocks.swapaxes(1, 2).reshape(rows * columns, -1)[:, ::2]
-    has_values = np.mean(np.isfinite(blocks), axis=1) > 0.5
+    blocks = np.sort(blocks.swapaxes(1, 2).reshape(rows * columns, -1), axis=1)  # NaN at the end
+    counts = np.count_nonzero(np.isfinite(blocks), axis=1)
+    has_values = counts > 0.5 * blocks.shape[1]
     if np.count_nonzero(has_values) < 8:
         return None
-    filled = np.where(np.isfinite(blocks), blocks, np.nanmedian(blocks[has_values]))
-    values = np.median(filled, axis=1)
+    values = np.where(has_values, blocks[np.arange(len(blocks)), counts // 2], 0.0)
     y, x = np.mgrid[-1 : 1 : rows * 1j, -1 : 1 : columns * 1j].reshape(2, -1)
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     fitted = np.full(len(values), np.median(values[has_values]))

@@ -50,17 +50,40 @@ def moved_point(b_from_a: Matrix, point: Doubles) -> tuple[Doubles, float]:
     return np.array([moved_x, moved_y]), scale
 
 
-def moved_box(b_from_a: Matrix, box: Doubles) -> Doubles:
-    """A box in the other picture, upright as before."""
-    center, scale = moved_point(b_from_a, 0.5 * (box[:2] + box[2:]))
-    return box_around(center, scale * (box[2:] - box[:2]))
+def turning(b_from_a: Matrix, point: Doubles) -> complex:
+    """How much larger and by which angle turned things are at a point (2,) of the other picture."""
+    around = point + np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+    low_x, high_x, low_y, high_y = (
+        complex(*place) for place in geometry.transform_points(b_from_a, around).tolist()
+    )
+    return 0.25 * ((high_x - low_x) - 1j * (high_y - low_y))
+
+
+def moved_points(b_from_a: Matrix, points: Doubles) -> tuple[Doubles, Doubles]:
+    """`moved_point` of each of the points (N, 2): places (N, 2), and scales (N,)."""
+    depths = points @ b_from_a[2, :2] + b_from_a[2, 2]
+    is_flat = np.abs(depths) < _LEAST_DEPTH
+    depths = np.where(is_flat, 1.0, depths)
+    moved = (points @ b_from_a[:2, :2].T + b_from_a[:2, 2]) / depths[:, None]
+    is_lost = is_flat | ~np.isfinite(moved).all(axis=1)
+    scales = np.sqrt(np.abs(np.linalg.det(b_from_a) / depths**3))
+    scales = np.where(is_lost, 1.0, np.clip(scales, 0.5, 2.0))
+    return np.where(is_lost[:, None], points, moved), scales
+
+
+def moved_boxes(b_from_a: Matrix, boxes: Doubles) -> tuple[Doubles, Doubles]:
+    """Boxes (N, 4) in the other picture, upright as before, and how much larger they are (N,)."""
+    middles, scales = moved_points(b_from_a, 0.5 * (boxes[:, :2] + boxes[:, 2:]))
+    halves = 0.5 * scales[:, None] * (boxes[:, 2:] - boxes[:, :2])
+    return np.concatenate([middles - halves, middles + halves], axis=1), scales
 
 
 def touched_edges(box: Doubles, size_wh: Size) -> npt.NDArray[np.bool_]:
     """Which of the picture's edges (4,) left, top, right, bottom a box reaches."""
-    low = box[:2] <= _EDGE_PX - 0.5
-    high = box[2:] >= np.array(size_wh) - 0.5 - _EDGE_PX
-    return np.concatenate([low, high])
+    x0, y0, x1, y1 = box.tolist()
+    width, height = size_wh
+    near, far = _EDGE_PX - 0.5, -0.5 - _EDGE_PX
+    return np.array([x0 <= near, y0 <= near, x1 >= width + far, y1 >= height + far])
 
 
 def overlap(one: Doubles, other: Doubles) -> tuple[float, float]:

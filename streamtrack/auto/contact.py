@@ -13,11 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
+from streamtrack.auto.anchor import Anchor, Held, align
 from streamtrack.auto.blobs import Blob, Scene
-from streamtrack.auto.boxes import box_around, overlap, overlaps
+from streamtrack.auto.boxes import box_around, overlap, overlaps, touched_edges
 from streamtrack.auto.followed import Followed, Life
 from streamtrack.auto.likeness import Likeness
 from streamtrack.auto.places import Moment, motion_within
+from streamtrack.pyramid import Pyramid
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
@@ -28,8 +30,10 @@ _CORE_SHARE = 0.75
 _ELDER_HITS = 10  # sightings of its own that make it a thing of its own
 _ALIKE_PX = 0.8  # grid pixels a frame, between motions of parts of one thing
 _DUPLICATE_OVERLAP = 0.75
+_SAME_OVERLAP = 0.6  # of boxes of which one is right
 _MOST_JOINED = 25  # frames in a row in one blob, after which parts of it are parts of one thing
 _BESIDE = 0.3  # of a thing's box in another's, less than which they lie side by side
+_KNOWN_HITS = 12  # sightings after which its box is right
 _PORTRAIT_FRAMES = 3  # between two pictures of a thing
 _MOST_GUESSED = 10  # frames that a hidden thing goes on as before
 
@@ -48,8 +52,58 @@ def note_contacts(things: Sequence[Followed], moment: Moment) -> None:
         thing.touches = count > 1
 
 
+def align_all(
+    things: Sequence[Followed],
+    pyramid: Pyramid,
+    turn: complex,
+    moment: Moment,
+) -> None:
+    """Put the things whose own picture is found to where it is, to a part of a pixel.
+
+    ``turn`` is what the camera's motion turns and enlarges.
+    """
+    there = []
+    for thing in things:
+        thing.is_aligned = False
+        if thing.held is None:
+            continue
+        thing.held.turn *= turn
+        if touched_edges(thing.box, moment.size_wh).any():
+            thing.held = None  # its box is cut from now on
+        elif thing.life in (Life.SEEN, Life.CARRIED):
+            there.append((thing, thing.held))
+    if not there:
+        return
+    centers = np.array([held.center_for(thing.center) for thing, held in there])
+    turns = np.array([held.turn for _, held in there])
+    found = align(pyramid, [held.anchor for _, held in there], centers, turns)
+    for row, (thing, held) in enumerate(there):
+        correlation = float(found.correlations[row]) if found.is_near[row] else 0.0
+        if held.is_found(correlation):
+            thing.align(complex(found.centers[row]), complex(found.turns[row]), moment.step_s)
+
+
+def hold(thing: Followed, pyramid: Pyramid, scene: Scene, moment: Moment) -> None:
+    """Take the exact picture of a thing that is seen alone and whole, if the last is no good."""
+    held = thing.held
+    if held is not None and not held.is_stale:
+        return
+    if thing.hits < _KNOWN_HITS or thing.touches:
+        return
+    if touched_edges(thing.box, moment.size_wh).any():
+        return
+    anchor = Anchor.taken(pyramid, thing.box, scene)
+    if anchor is not None:
+        thing.held = Held(anchor, thing.size)
+        if held is not None:
+            thing.held.looks = held.looks
+
+
 def sight(thing: Followed, scene: Scene, moment: Moment) -> bool:
     """Move a thing to where its own picture is seen, if it is."""
+    if thing.is_aligned:
+        thing.guessed = thing.misses = 0
+        return True
     if thing.likeness is None:
         return False
     beside = thing.likeness.find(scene.image, _core(thing, scene), thing.guessed)
@@ -120,7 +174,7 @@ def _is_own(thing: Followed, beside: Sequence[Followed]) -> bool:
 def end_duplicates(things: Sequence[Followed], moment: Moment) -> None:
     """Of two things at one place, moving alike, the one that was seen for longer is right.
 
-    Two that were each seen alone are two.
+    Two that were each seen alone are two, unless the picture of only one of them is seen there.
     """
     named = [thing for thing in things if thing.life in (Life.SEEN, Life.CARRIED)]
     if len(named) < 2:
@@ -130,6 +184,10 @@ def end_duplicates(things: Sequence[Followed], moment: Moment) -> None:
     common, inside = overlaps(boxes, boxes)
     for row, column in np.argwhere(np.tril(inside > _DUPLICATE_OVERLAP, -1)).tolist():
         younger, elder = named[row], named[column]
+        if common[row, column] > _SAME_OVERLAP and younger.is_aligned != elder.is_aligned:
+            mistaken = elder if younger.is_aligned else younger
+            mistaken.life, mistaken.reason = Life.LOST, "another is seen in its place"
+            continue
         if elder.life is Life.OVER or min(younger.alone, elder.alone) >= _ELDER_HITS:
             continue
         if common[row, column] > _DUPLICATE_OVERLAP or is_alike(elder, younger, moment):
@@ -149,7 +207,7 @@ def hold_to_edges(things: Sequence[Followed], blob: Blob) -> None:
         last = max(things, key=lambda thing: float(thing.box[axis + 2]))
         for thing, edge in ((first, axis), (last, axis + 2)):
             off = float(blob.box[edge] - thing.box[edge])
-            if abs(off) <= 0.25 * float(thing.size[axis]):
+            if not thing.is_aligned and abs(off) <= 0.25 * float(thing.size[axis]):
                 thing.box[[axis, axis + 2]] += 0.3 * off
 
 

@@ -8,14 +8,13 @@ something: it keeps its size for a while, too.
 
 from __future__ import annotations
 
+import math
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from streamtrack.auto.blobs import Blob
-from streamtrack.auto.boxes import moved_box
-from streamtrack.types import Matrix
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
@@ -29,49 +28,55 @@ _ODD_FRAMES = 7  # for which it keeps its size all the same
 class FreeEnds:
     """State of the ends of one thing, along x and y.
 
-    ``share`` (2, 2) is the part of its pixels' motion by which the low and the high end moved on.
+    ``share`` is the part of its pixels' motion by which the ends left, top, right and bottom moved
+    on; ``box`` (4,) is where they were in the frame before, None if that is not known.
     """
 
     def __init__(self) -> None:
-        self.share: Doubles = np.ones((2, 2))
-        self._box: Doubles | None = None
-        self._odd = np.zeros(2, np.intp)
-
-    def predict(self, frame_from_before: Matrix) -> None:
-        if self._box is not None:
-            self._box = moved_box(frame_from_before, self._box)
+        self.share = [1.0, 1.0, 1.0, 1.0]
+        self.box: Doubles | None = None
+        self._odd = [0, 0]
 
     def forget(self) -> None:
         """Its ends were not seen in this frame."""
-        self._box = None
+        self.box = None
 
     def look(self, blob: Blob) -> None:
         """Note how the ends of the blob, as which it was found, moved since the frame before."""
-        before, self._box = self._box, blob.box.copy()
-        if before is None or not np.isfinite(blob.motion).all():
+        before, self.box = self.box, blob.box.copy()
+        motion = blob.motion.tolist()
+        if before is None or not math.isfinite(motion[0] + motion[1]):
             return
-        speed = np.abs(blob.motion)
-        is_moving = speed > max(_LEAST_MOTION_PX, 0.5 * float(speed.max()))
-        if not is_moving.any():
+        moved = (blob.box - before).tolist()
+        least = max(_LEAST_MOTION_PX, 0.5 * max(abs(motion[0]), abs(motion[1])))
+        if max(abs(motion[0]), abs(motion[1])) <= least:
             return
-        moved = (blob.box - before).reshape(2, 2) / np.where(is_moving, blob.motion, 1.0)
-        share = self.share + _RATE * (np.clip(moved, -1.0, 2.0) - self.share)
-        self.share = np.where(is_moving, share, 1.0)
+        for end in range(4):
+            along = motion[end % 2]
+            if abs(along) > least:
+                share = min(2.0, max(-1.0, moved[end] / along))
+                self.share[end] += _RATE * (share - self.share[end])
+            else:
+                self.share[end] = 1.0
 
     def correction(self, box: Doubles, found: Doubles) -> tuple[Doubles, Doubles]:
         """Shift (2,) and growth (2,) that take a thing's box towards the blob's."""
-        low, high = (found - box).reshape(2, 2)
-        shift, growth = by_both_ends(box, found)
-        ratio = (found[2:] - found[:2]) / np.maximum(box[2:] - box[:2], 1e-6)
-        is_odd = (ratio < _CUT_SHARE) | (ratio > _GROWN_SHARE)
-        self._odd = np.where(is_odd, self._odd + 1, 0)
-        is_odd &= self._odd <= _ODD_FRAMES
-        is_free = self.share > 0.5
-        is_hidden = (is_free[0] ^ is_free[1]) & (growth < 0)
-        nearer = np.where(np.abs(low) <= np.abs(high), low, high)
-        shift = np.where(is_odd, nearer, shift)
-        shift = np.where(is_hidden, np.where(is_free[0], low, high), shift)
-        return shift, np.where(is_hidden | is_odd, 0.0, growth)
+        ends, found_ends = box.tolist(), found.tolist()
+        shift, growth = [0.0, 0.0], [0.0, 0.0]
+        for axis in (0, 1):
+            low, high = found_ends[axis] - ends[axis], found_ends[axis + 2] - ends[axis + 2]
+            size = max(ends[axis + 2] - ends[axis], 1e-6)
+            ratio = (found_ends[axis + 2] - found_ends[axis]) / size
+            is_odd = not _CUT_SHARE <= ratio <= _GROWN_SHARE
+            self._odd[axis] = self._odd[axis] + 1 if is_odd else 0
+            is_free = self.share[axis] > 0.5
+            if is_free != (self.share[axis + 2] > 0.5) and high < low:
+                shift[axis] = low if is_free else high
+            elif is_odd and self._odd[axis] <= _ODD_FRAMES:
+                shift[axis] = low if abs(low) <= abs(high) else high
+            else:
+                shift[axis], growth[axis] = 0.5 * (low + high), high - low
+        return np.array(shift), np.array(growth)
 
 
 def by_both_ends(box: Doubles, found: Doubles) -> tuple[Doubles, Doubles]:

@@ -124,11 +124,10 @@ def motion_within(scene: Scene, box: Doubles) -> tuple[Doubles, float] | None:
     if scene.motion is None:
         return None
     corners = geometry.transform_points(scene.grid_from_frame, box.reshape(2, 2))
-    height, width = scene.solid.shape
     if not np.isfinite(corners).all():
         return None
     x0, y0, x1, y1 = np.rint(np.clip(corners.ravel(), -1e5, 1e5)).astype(int).tolist()
-    window = slice(max(0, y0), min(height, y1 + 1)), slice(max(0, x0), min(width, x1 + 1))
+    window = slice(max(0, y0), max(0, y1 + 1)), slice(max(0, x0), max(0, x1 + 1))
     inside = scene.solid[window]
     count = int(np.count_nonzero(inside))
     if count < 6:

@@ -18,10 +18,12 @@ from streamtrack import geometry
 from streamtrack.auto.association import associate, found_again
 from streamtrack.auto.background import BackgroundModel, Outstanding
 from streamtrack.auto.blobs import Blob, MotionField, Scene, find_blobs, frame_px
-from streamtrack.auto.boxes import overlap, touched_edges
+from streamtrack.auto.boxes import overlap, touched_edges, turning
 from streamtrack.auto.contact import (
+    align_all,
     carry,
     end_duplicates,
+    hold,
     hold_to_edges,
     is_whole,
     note_contacts,
@@ -29,7 +31,7 @@ from streamtrack.auto.contact import (
     portray,
     sight,
 )
-from streamtrack.auto.followed import Followed, Life
+from streamtrack.auto.followed import Followed, Life, predict_all
 from streamtrack.auto.places import (
     REST_PX,
     Moment,
@@ -41,6 +43,7 @@ from streamtrack.auto.places import (
     resting_share,
 )
 from streamtrack.frame_view import FrameView
+from streamtrack.pyramid import Pyramid
 from streamtrack.types import (
     CameraPose,
     Image,
@@ -118,7 +121,7 @@ class AutoTargets:
         if self._background is None or self._background.size_wh != size_wh:
             self._background = BackgroundModel(size_wh, world_from_small)
         seen = self._background.compare(small, world_from_small, small_from_frame)
-        self._predict(world_from_frame, view.frame.time_s)
+        turn = self._predict(world_from_frame, view.frame.time_s, view.size_wh)
         if not seen.is_explained:
             return self._broken_off(world_from_small, small, small_from_frame)
         self._broken = 0
@@ -129,7 +132,8 @@ class AutoTargets:
         self.blobs = scene.blobs
         is_fixed = np.array_equal(world_from_frame, np.eye(3))
         moment = Moment(step_s, frame_px(seen), view.size_wh, is_fixed)
-        self._associate(scene, moment)
+        align_all(self._things, view.pyramid, turn, moment)
+        self._associate(scene, view.pyramid, moment)
         self._background.learn(seen, moving, self._protected(seen))
         self._confirm(self._background, seen, scene, moment)
         end_duplicates(self._things, moment)
@@ -145,7 +149,9 @@ class AutoTargets:
         self._step_s = step_s
         return step_s
 
-    def _predict(self, world_from_frame: Matrix, time_s: float) -> None:
+    def _predict(self, world_from_frame: Matrix, time_s: float, size_wh: Size) -> complex:
+        """Move all on to this frame; how the camera's motion turns and enlarges the picture."""
+        turn = 1.0 + 0j
         if self._world_from_before is not None:
             frame_from_before = geometry.normalized(
                 geometry.inverted(world_from_frame) @ self._world_from_before
@@ -153,10 +159,12 @@ class AutoTargets:
             for thing in self._things:
                 if thing.life is Life.LOST and thing.lost_s > _SLOWER_AFTER_S:
                     thing.velocity = thing.velocity * 0.9
-                thing.predict(frame_from_before, time_s)
+            predict_all(self._things, frame_from_before, time_s)
+            turn = turning(frame_from_before, 0.5 * np.array(size_wh))
         self._world_from_before = world_from_frame
+        return turn
 
-    def _associate(self, scene: Scene, moment: Moment) -> None:
+    def _associate(self, scene: Scene, pyramid: Pyramid, moment: Moment) -> None:
         note_contacts(self._things, moment)
         met = [t for t in self._things if t.touches and sight(t, scene, moment)]
         found = associate(self._things, scene.blobs, _REACH_PX * moment.grid_px)
@@ -182,6 +190,8 @@ class AutoTargets:
             thing.take(blob, moment.step_s, moment.size_wh)
             thing.resume(Life.SEEN)
             portray(thing, blob, scene)
+            if thing.life is Life.SEEN and is_whole(thing, blob):
+                hold(thing, pyramid, scene, moment)
         for thing in self._things:
             if thing not in met:
                 self._miss(thing, scene, moment)
@@ -332,13 +342,14 @@ def _end_left_place(thing: Followed, background: BackgroundModel, scene: Scene) 
 def _is_over(thing: Followed, size_wh: Size) -> bool:
     if thing.life is Life.NEW:
         return thing.misses > _MAX_MISSES
+    middle, size = thing.center, np.array(size_wh)
+    if bool((middle < 0).any() or (middle > size - 1).any()):
+        return True
     if thing.life is not Life.LOST:
         return thing.life is Life.OVER
-    middle, size = thing.center, np.array(size_wh)
-    is_outside = bool((middle < 0).any() or (middle > size - 1).any())
     edges = touched_edges(thing.box, size_wh)
     outward = np.concatenate([thing.velocity < 0, thing.velocity > 0])
-    return is_outside or bool((edges & outward).any()) or thing.lost_s > _COAST_S
+    return bool((edges & outward).any()) or thing.lost_s > _COAST_S
 
 
 def _has_moved(thing: Followed, frame_px: float) -> bool:

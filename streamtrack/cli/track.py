@@ -114,13 +114,17 @@ def track(
     ] = None,
     stabilize: Annotated[
         Path | None,
-        typer.Option(help="The video held still: .mp4, .mkv, .webm, .avi."),
+        typer.Option(
+            help="The video held still: .mp4, .mkv, .webm, .avi. Every frame is shown at its "
+            "time; those without a known pose are counted."
+        ),
     ] = None,
     stabilize_path: Annotated[
         str | None,
         typer.Option(
             help="smooth (default): follows the camera's mean motion, cropped by 6 per cent a "
-            "side; world: the place that the first frame showed.",
+            "side, frames without a pose as they are; world: the place that the first frame "
+            "showed, what a frame does not reach darkened, as it was seen last.",
         ),
     ] = None,
     live: Annotated[

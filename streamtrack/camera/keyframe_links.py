@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.camera.keyframes import Keyframe, KeyframeGraph
+from streamtrack.camera.lens import seen_bend
 from streamtrack.camera.view_alignment import align, align_exactly
 from streamtrack.camera.view_levels import ReferenceView, ViewLevels
 from streamtrack.camera.view_verdict import ViewAlignment
@@ -152,6 +153,8 @@ class Draft:
         self._dropped: set[tuple[int, int]] = set()
         self._moved: dict[int, Matrix] = {}
         self._sigmas_px: Mapping[int, float] | None = None
+        self.lens = graph.lens
+        self.bends: list[float] = []
 
     def add(self, link: Link, is_loop: bool) -> None:
         """Join two keyframes."""
@@ -182,6 +185,7 @@ class Draft:
             graph.add_link(link, is_loop)
         if self._moved:
             graph.move(self._moved)
+        graph.lens = self.lens
         if self._sigmas_px is not None:
             graph.expect(self._sigmas_px)
 
@@ -200,8 +204,10 @@ def measure_exactly(draft: Draft, new: NewKeyframe, levels: ViewLevels) -> None:
         return
     draft.drop({(new.index, new.chained_to)})
     draft.add(link_of(new.chained_to, new.index, exact), is_loop=False)
+    size_wh = draft.keyframes[new.index].size_wh
+    draft.bends.append(seen_bend(exact, size_wh))
     world_from_before = draft.keyframes[new.chained_to].world_from_keyframe
-    pose = world_from_before @ geometry.inverted(exact.reference_from_view)
+    pose = world_from_before @ geometry.inverted(draft.lens.flat(exact, size_wh))
     draft.move({new.index: geometry.normalized(pose)})
 
 
@@ -254,9 +260,10 @@ def _try(draft: Draft, new: NewKeyframe, other: int, cache: LevelCache) -> Joine
     if found.reference_from_view is None:
         return None
     draft.add(link_of(other, new.index, found), is_loop)
+    draft.bends.append(seen_bend(found, here.size_wh))
     corners = found.view_points[found.is_inlier]
     expected = geometry.transform_points(guess, corners)
-    measured = geometry.transform_points(found.reference_from_view, corners)
+    measured = geometry.transform_points(draft.lens.flat(found, here.size_wh), corners)
     off_px = float(np.sqrt(np.mean(np.sum((expected - measured) ** 2, axis=1))))
     return Joined(off_px, is_loop)
 
@@ -266,7 +273,8 @@ def adjust_all(draft: Draft) -> None:
 
     What errors are expected of the poses is told, too.
     """
-    keyframes, links = draft.keyframes, draft.links
+    keyframes = draft.keyframes
+    links = [draft.lens.link(link, keyframes[link.a].size_wh) for link in draft.links]
     sizes = {index: keyframe.size_wh for index, keyframe in keyframes.items()}
     poses = {index: keyframe.world_from_keyframe for index, keyframe in keyframes.items()}
     first = next(iter(keyframes))
@@ -283,7 +291,11 @@ def adjust_around(draft: Draft) -> None:
     """Adjust the last keyframes to all that they hang on."""
     keyframes = draft.keyframes
     free = set(list(keyframes)[-_WINDOW:]) - {next(iter(keyframes))}
-    near = [link for link in draft.links if link.a in free or link.b in free]
+    near = [
+        draft.lens.link(link, keyframes[link.a].size_wh)
+        for link in draft.links
+        if link.a in free or link.b in free
+    ]
     held = {end for link in near for end in (link.a, link.b)} - free
     if not held:
         return

@@ -20,6 +20,7 @@ import numpy as np
 
 from streamtrack import geometry
 from streamtrack.camera.frame_poses import FramePose, FramePoses
+from streamtrack.camera.lens import STRAIGHT
 from streamtrack.errors import OutputError
 from streamtrack.mosaic.spill import Slot, SpillFile
 from streamtrack.mosaic.types import Link
@@ -107,6 +108,7 @@ class Keyframe:
 class KeyframeGraph:
     """Keyframes, the verified links between them, and every frame's pose against one of them.
 
+    Poses map pixels that are straight by ``lens``; links hold them as they were seen.
     ``revision`` counts how often keyframes were moved. One thread adds, and asks for frames; any
     may read what there is of keyframes. Of more than ``most_frames`` (None: no limit) the oldest
     are forgotten, except those that are to be kept.
@@ -123,6 +125,7 @@ class KeyframeGraph:
         self._frames = FramePoses(most_frames)
         self._revision = 0
         self._sigmas_px: dict[int, float] = {}
+        self.lens = STRAIGHT
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]:

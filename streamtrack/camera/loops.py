@@ -12,10 +12,12 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from math import isfinite
 
 from streamtrack.camera import keyframe_links
 from streamtrack.camera.keyframe_links import Draft, Joined, LevelCache, NewKeyframe
 from streamtrack.camera.keyframes import KeyframeGraph
+from streamtrack.camera.lens import agreed, is_news
 
 _LINK_FRAMES = 4  # after which the result of linking a keyframe is taken over
 _LINKS_A_FRAME = 8  # adjusting so many takes a frame more
@@ -23,6 +25,7 @@ _MOST_WAITING = 8
 _MAX_SURPRISE_PX = 1.0  # of an edge, beyond which all poses are adjusted
 _GROWTH = 1.1  # factor between the sizes of a graph at two adjustments of all that no loop forces
 _LEAST_GROWTH = 1.02  # and that one does
+_MOST_BENDS = 256
 _MAX_SAME_PLACE = 0.8  # overlap with the keyframe last compared, above which nothing new is seen
 
 
@@ -52,6 +55,7 @@ class LoopCloser:
         self._adjusted_at = 1
         self._compared: int | None = None
         self._thread: ThreadPoolExecutor | None = None
+        self._bends: deque[float] = deque(maxlen=_MOST_BENDS)
 
     def add(self, keyframe: NewKeyframe) -> None:
         """Link a new keyframe that the graph already holds."""
@@ -120,6 +124,11 @@ class LoopCloser:
             keyframe_links.adjust_around(draft)
         growth = len(draft.keyframes) / self._adjusted_at
         is_surprise = any(one.is_loop and one.surprise_px > _MAX_SURPRISE_PX for one in found)
+        self._bends.extend(bend for bend in draft.bends if isfinite(bend))
+        lens = agreed(self._bends)
+        if is_news(lens, draft.lens):
+            draft.lens = lens
+            return True
         is_grown = growth >= _GROWTH + 4 / self._adjusted_at
         return is_grown or (is_surprise and growth >= _LEAST_GROWTH)
 

@@ -190,9 +190,10 @@ class MovingCamera:
 
     def _accepted(self, placed: Placed, sight: Sight) -> CameraPose:
         """The pose of a frame in a keyframe; goes over to another one where that is better."""
-        keyframe, found, keyframe_from_frame = placed.keyframe, placed.found, placed.pose
+        keyframe, found = placed.keyframe, placed.found
         if self._shear.is_sheared(keyframe, found, sight.size_wh):
             return placed.camera_pose(None, Verdict.SHEARED)
+        keyframe_from_frame = self.graph.lens.flat(found, sight.size_wh)
         world_from_frame = self._in_world(keyframe, keyframe_from_frame)
         before = self._state
         self._remember(placed, sight)
@@ -262,7 +263,9 @@ class MovingCamera:
 
         It is measured exactly later, unless so little agrees that it must be done at once.
         """
-        keyframe, found, keyframe_from_frame = placed.keyframe, placed.found, placed.pose
+        keyframe, found = placed.keyframe, placed.found
+        lens, size_wh = self.graph.lens, sight.size_wh
+        keyframe_from_frame = lens.flat(found, size_wh)
         is_sharp = found.sharpness >= _MIN_SHARPNESS
         if not is_sharp and placed.overlap(sight) >= _MIN_OVERLAP_UNSHARP:
             return False
@@ -271,12 +274,12 @@ class MovingCamera:
         link = link_of(index, keyframe, found)
         is_sure = found.inliers >= _MIN_AGREEING_CELLS
         if not is_sure:
-            guess = geometry.inverted(keyframe_from_frame)
+            guess = geometry.inverted(placed.pose)
             there = self.graph.keyframes[keyframe].hidden
             exact = align_exactly(reference, self._levels.get(keyframe), guess, there)
             if exact.reference_from_view is None:
                 return False
-            keyframe_from_frame = geometry.inverted(exact.reference_from_view)
+            keyframe_from_frame = geometry.inverted(lens.flat(exact, size_wh))
             link = link_of(keyframe, index, exact)
         self._take(sight.view, reference, self._in_world(keyframe, keyframe_from_frame), link)
         self._shear.extend(keyframe, found, index)

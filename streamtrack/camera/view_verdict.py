@@ -6,7 +6,7 @@ point pairs on which the verdict rests.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import cv2
@@ -43,6 +43,8 @@ class ViewAlignment:
     rmse_px              of the shifts that agreeing cells would still like to make, view pixels
     correlation          normalised cross-correlation of the agreeing cells' pixels, or NaN
     corner_sigma_px      predicted error of the view's corners, reference pixels, or inf
+    gradients            (M, 5) sums over each cell's pixels, of the reference's gradients xx, xy
+                         and yy a reference pixel, and of their products with what differs
     sharpness            gradient energy of the view against the reference's: below 1 if blurred
     """
 
@@ -55,6 +57,7 @@ class ViewAlignment:
     correlation: float = float("nan")
     corner_sigma_px: float = float("inf")
     sharpness: float = float("nan")
+    gradients: Doubles = field(default_factory=lambda: np.zeros((0, 5)))
 
     @property
     def inliers(self) -> int:
@@ -88,6 +91,7 @@ def judged(reference: ReferenceView, view: ViewLevels, fitted: Fitted) -> ViewAl
     reference_from_level = geometry.inverted(reference.levels.level_from_view(fitted.level))
     reference_points = geometry.transform_points(reference_from_level, cells.middles)
     view_points = geometry.transform_points(fitted.view_from_reference, reference_points)
+    scale = 1 / float(reference_from_level[0, 0])
     view_px = view.size_wh[0] / view.images[fitted.level].shape[1]
     agreeing = cells.is_agreeing
     shifts = cells.shifts_px[agreeing]
@@ -106,6 +110,7 @@ def judged(reference: ReferenceView, view: ViewLevels, fitted: Fitted) -> ViewAl
         cells.correlation,
         sigma_px,
         cells.sharpness,
+        cells.gradients * [scale**2, scale**2, scale**2, scale, scale],
     )
 
 
@@ -134,6 +139,7 @@ class _Cells:
     is_agreeing: Mask
     correlation: float
     sharpness: float
+    gradients: Doubles
 
 
 def _cells(fitted: Fitted, max_shift_px: float) -> _Cells:
@@ -166,6 +172,7 @@ def _cells(fitted: Fitted, max_shift_px: float) -> _Cells:
     # Shift that would suit the cell's own pixels best, held small where texture says nothing.
     xx, yy = xx + n, yy + n
     shift = np.hypot(yy * rx - xy * ry, xx * ry - xy * rx) / (xx * yy - xy * xy)
+    gradients = np.stack([xx, xy, yy, rx, ry], axis=1)
     shown = n >= _MIN_CELL_PIXELS
     agreeing = shown & (correlation >= _MIN_CELL_CORRELATION) & (shift <= max_shift_px)
     middles = np.stack([sum_x / n, sum_y / n], axis=1)
@@ -175,7 +182,7 @@ def _cells(fitted: Fitted, max_shift_px: float) -> _Cells:
         variance_w, variance_g = ww / count - (w / count) ** 2, gg / count - (g / count) ** 2
         together = float((wg / count - w * g / count**2) / np.sqrt(variance_w * variance_g + 1e-9))
         ratio = float(np.sqrt(variance_g / max(float(variance_w), 1e-9)))
-    return _Cells(middles[shown], shift[shown], agreeing[shown], together, ratio)
+    return _Cells(middles[shown], shift[shown], agreeing[shown], together, ratio, gradients[shown])
 
 
 def _support_verdict(cells: _Cells, view_points: Points, size_wh: Size) -> Verdict:

@@ -6,7 +6,8 @@ Scenes are `synthetic://traffic` before a fixed and a moving camera, with and wi
 that hide the cars. The other trackers get the same detections (the blobs that streamtrack itself
 associates), in pixels of the frame. Measures are TrackEval's own code at IoU 0.5 (HOTA: all of its
 thresholds). A true box is the upright box of a car's corners inside the picture; cars that are
-shown to less than `SHOWN_SHARE` count neither way.
+shown to less than `SHOWN_SHARE` count neither way. `off` is how far the middles of wholly shown
+cars are off, `strays` by how much that changes from one frame to the next.
 
 Needs, beside streamtrack: pip install trackeval; and for the others what of them is to take part:
 pip install --no-deps norfair filterpy trackers "supervision<0.28" (plus what these import).
@@ -38,6 +39,7 @@ from streamtrack.sources.synthetic import SyntheticSource
 
 SHOWN_SHARE = 0.3
 MIN_IOU = 0.5
+EDGE_PX = 2.0
 Boxes = npt.NDArray[np.float64]
 Named = tuple[list[str], Boxes]
 """Names and boxes (N, 4) x0, y0, x1, y1 of one frame."""
@@ -49,6 +51,8 @@ class Run:
 
     truth: list[Named]
     is_shown: list[npt.NDArray[np.bool_]]
+    is_whole: list[npt.NDArray[np.bool_]]
+    size_wh: tuple[int, int]
     found: list[Named]
     detections: list[Boxes]
     auto_ms: float
@@ -64,7 +68,7 @@ def run_own(uri: str, camera_mode: str) -> Run:
         make_camera(settings),
         AutoTargets(),
     )
-    truth, shown, found, detections = [], [], [], []
+    truth, shown, whole, found, detections = [], [], [], [], []
     auto_s = camera_s = 0.0
     for frame in source:
         view = FrameView(frame, extractor)
@@ -77,13 +81,16 @@ def run_own(uri: str, camera_mode: str) -> Run:
         names, boxes, is_shown = true_boxes(source, frame.index)
         truth.append((names, boxes))
         shown.append(is_shown)
+        whole.append(np.array([t.visible_share > 0.98 for t in source.things(frame.index)], bool))
         tracking = [track for track in tracks if track.quad is not None]
         quads = [bounding_box(track.quad) for track in tracking if track.quad is not None]
         found.append(([track.name for track in tracking], as_boxes(quads)))
         detections.append(as_boxes([blob.box for blob in auto.blobs]))
     count = len(truth)
     most = max(int(np.count_nonzero(is_shown)) for is_shown in shown)
-    return Run(truth, shown, found, detections, 1e3 * auto_s / count, 1e3 * camera_s / count, most)
+    size_wh = source.info.size_wh
+    costs_ms = 1e3 * auto_s / count, 1e3 * camera_s / count
+    return Run(truth, shown, whole, size_wh, found, detections, *costs_ms, most)
 
 
 def true_boxes(
@@ -133,7 +140,34 @@ def evaluation_data(run: Run, found: Sequence[Named]) -> dict[str, object]:
     }
 
 
+def position_errors(run: Run, found: Sequence[Named]) -> tuple[Boxes, Boxes]:
+    """How far off the middles (N,), px, of wholly shown things are, and how far they then stray.
+
+    The second (M,) is how much that offset changes from one frame to the next: the error of the
+    motion, free of where a box is drawn around a thing.
+    """
+    width, height = run.size_wh
+    offsets: list[tuple[int, str, Boxes]] = []
+    for index, ((names, boxes), is_whole, (_, found_boxes)) in enumerate(
+        zip(run.truth, run.is_whole, found, strict=True)
+    ):
+        inside = (boxes[:, :2] > EDGE_PX).all(axis=1)
+        inside &= (boxes[:, 2:] < np.array([width, height]) - EDGE_PX).all(axis=1)
+        ious, _ = overlaps(boxes, found_boxes)
+        for row, column in assign(np.where(ious >= MIN_IOU, -ious, np.inf)):
+            if is_whole[row] and inside[row]:
+                off = (found_boxes[column] - boxes[row]).reshape(2, 2).mean(axis=0)
+                offsets.append((index, names[row], off))
+    before = {(index + 1, name): off for index, name, off in offsets}
+    strayed = [off - before[index, name] for index, name, off in offsets if (index, name) in before]
+    return (
+        np.hypot(*np.reshape([off for _, _, off in offsets], (-1, 2)).T),
+        np.hypot(*np.reshape(strayed, (-1, 2)).T),
+    )
+
+
 def score(run: Run, found: Sequence[Named]) -> dict[str, float]:
+    off_px, strayed_px = position_errors(run, found)
     with contextlib.redirect_stdout(io.StringIO()):
         from trackeval.metrics import CLEAR, HOTA, Identity
 
@@ -145,6 +179,8 @@ def score(run: Run, found: Sequence[Named]) -> dict[str, float]:
         "MOTA": float(clear["MOTA"]),
         "IDF1": float(identity["IDF1"]),
         "HOTA": float(np.mean(hota["HOTA"])),
+        "off_px": float(np.mean(off_px)) if len(off_px) else float("nan"),
+        "strayed_px": float(np.mean(strayed_px)) if len(strayed_px) else float("nan"),
         "switches": float(clear["IDSW"]),
         "false": float(clear["CLR_FP"]),
         "missed": float(clear["CLR_FN"]),
@@ -271,8 +307,10 @@ def main() -> None:
             rows.setdefault((name, method), []).append(scored)
             if args.each and method == "streamtrack":
                 print(uri, line(method, [scored]), flush=True)
-    lines = ["| scene | method | MOTA | IDF1 | HOTA | switches | false | missed | ids / things |"]
-    lines.append("|---|---|---|---|---|---|---|---|---|")
+    lines = [
+        "| scene | method | MOTA | IDF1 | HOTA | switches | false | missed | off px | strays px a frame | ids / things |"
+    ]
+    lines.append("|---|---|---|---|---|---|---|---|---|---|---|")
     lines += [f"| {name} {line(method, scored)}" for (name, method), scored in rows.items()]
     for name, cost in costs.items():
         auto, camera_ms, most = (
@@ -298,6 +336,7 @@ def line(method: str, scored: Sequence[dict[str, float]]) -> str:
     return (
         f"| {method} | {mean('MOTA'):.3f} | {mean('IDF1'):.3f} | {mean('HOTA'):.3f} "
         f"| {mean('switches'):.1f} | {share('false'):.1%} | {share('missed'):.1%} "
+        f"| {mean('off_px'):.2f} | {mean('strayed_px'):.2f} "
         f"| {mean('ids'):.1f} / {mean('things'):.1f} |"
     )
 

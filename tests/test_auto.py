@@ -15,14 +15,18 @@ from rrd import rrd_columns
 
 from streamtrack import AutoTarget, track
 from streamtrack.auto import AutoTargets
+from streamtrack.auto.anchor import Anchor, align
 from streamtrack.auto.assignment import assign
+from streamtrack.auto.blobs import Scene
 from streamtrack.auto.boxes import overlap
+from streamtrack.auto.places import motion_within
 from streamtrack.errors import UsageError
 from streamtrack.features import FeatureExtractor
 from streamtrack.frame_view import FrameView
 from streamtrack.geometry import bounding_box, box_quad, translation
 from streamtrack.job import TrackJob, run_track
 from streamtrack.progress import NoProgress
+from streamtrack.pyramid import Pyramid
 from streamtrack.settings import Settings
 from streamtrack.sources import open_source
 from streamtrack.targets import Target, given_targets, parse_targets
@@ -462,3 +466,36 @@ def test_a_summary_says_that_nothing_moved() -> None:
 def test_boxes_overlap() -> None:
     one = np.array(bounding_box(box_quad(0, 0, 10, 10)))
     assert overlap(one, one + np.array([5, 0, 5, 0])) == pytest.approx((50 / 150, 0.5))
+
+
+@pytest.mark.parametrize("side", [-60.0, 330.0])
+def test_no_motion_is_read_beside_the_picture(side: float) -> None:
+    solid = np.ones((SIZE[1], SIZE[0]), np.bool_)
+    motion = np.ones((SIZE[1], SIZE[0], 2), np.float32)
+    scene = Scene((), solid, motion, np.zeros((SIZE[1], SIZE[0], 3), np.uint8), np.eye(3))
+    box = np.array([side, 100.0, side + 40, 140.0])
+    assert motion_within(scene, box) is None
+    assert motion_within(scene, np.array([100.0, 100.0, 140.0, 140.0])) is not None
+
+
+def test_anchors_are_aligned_to_a_part_of_a_pixel() -> None:
+    world = World()
+    thing = texture(20, (80, 40), 150, 250)
+    box = np.array([99.5, 79.5, 179.5, 119.5])
+    solid = np.ones((SIZE[1], SIZE[0]), np.bool_)
+    pictures = []
+    for x in (100.0, 102.3):
+        picture = world.ground[:, : SIZE[0]].copy()
+        moved = np.array([[1, 0, x], [0, 1, 80.0]])
+        cv2.warpAffine(thing, moved, SIZE, picture, borderMode=cv2.BORDER_TRANSPARENT)
+        pictures.append(picture)
+    scene = Scene((), solid, None, pictures[0], np.eye(3))
+    first, second = (Pyramid(cv2.cvtColor(p, cv2.COLOR_BGR2GRAY)) for p in pictures)
+    anchor = Anchor.taken(first, box, scene)
+    assert anchor is not None
+    middle = np.array([complex(139.5, 99.5)])
+    found = align(second, [anchor], middle, np.ones(1, np.complex128))
+    assert found.is_near[0] and found.correlations[0] > 0.9
+    assert abs(found.centers[0] - (middle[0] + 2.3)) < 0.1
+    blank = Pyramid(np.full((SIZE[1], SIZE[0]), 128, np.uint8))
+    assert align(blank, [anchor], middle, np.ones(1, np.complex128)).correlations[0] < 0.5

@@ -308,7 +308,7 @@ def main() -> None:
             if args.each and method == "streamtrack":
                 print(uri, line(method, [scored]), flush=True)
     lines = [
-        "| scene | method | MOTA | IDF1 | HOTA | switches | false | missed | off px | strays px a frame | ids / things |"
+        "| scene | by | MOTA | IDF1 | HOTA | switches | false | missed | off px | strays | ids |"
     ]
     lines.append("|---|---|---|---|---|---|---|---|---|---|---|")
     lines += [f"| {name} {line(method, scored)}" for (name, method), scored in rows.items()]

@@ -372,6 +372,7 @@ class CameraPose:
     the first keyframe, NaN if it is not known. ``warning`` says what is wrong although the pose is
     given: a fixed camera that was moved.
     ``kind`` is what `--camera auto` takes the camera for in this frame, None if it was told.
+    ``overlay`` are quads (4, 2) in the frame that lie over every picture: bars, text, a bonnet.
     """
 
     world_from_frame: Matrix | None
@@ -384,6 +385,7 @@ class CameraPose:
     warning: str = ""
     kind: CameraKind | None = None
     sigma_px: float = float("nan")
+    overlay: tuple[Points, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

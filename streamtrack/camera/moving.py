@@ -21,6 +21,7 @@ from streamtrack.camera.keyframe_links import LevelCache, NewKeyframe, link_of, 
 from streamtrack.camera.keyframes import KeyframeGraph
 from streamtrack.camera.layers import Doubts, separated
 from streamtrack.camera.loops import LoopCloser
+from streamtrack.camera.picture_overlay import OverlayWatch
 from streamtrack.camera.placed import Placed, Sight
 from streamtrack.camera.relocalising import Relocaliser
 from streamtrack.camera.shear import ShearWatch
@@ -45,6 +46,7 @@ _MIN_TEXTURED_CELLS = 12
 _MAX_AREA_JUMP = 1.5
 _MAX_STRETCH = 4.0
 _MAX_STEPS_AHEAD = 8
+_MAX_LAST_OVERLAP = 0.9  # with its keyframe, of a view that is kept when the camera is lost
 _REFERENCES_KEPT = 6
 _MARGIN_PX = 8.0  # of the usual level, around the targets
 _MOST_LIVE_FRAMES = 200_000
@@ -72,22 +74,23 @@ class CameraEstimator(Protocol):
 class _State:
     """Where the camera was last known to be.
 
-    ``levels`` is what it saw there. ``step`` is the motion (last frame from next, a similarity) in
-    ``step_s`` seconds, None if it is not known.
+    ``sight`` is what it saw there, ``placed`` how that was found out, None of the first frame.
+    ``step`` is the motion (last frame from next, a similarity) in ``step_s`` seconds, None if it is
+    not known.
     """
 
     keyframe: int
     keyframe_from_frame: Matrix
-    levels: ViewLevels
-    time_s: float
-    step: Matrix | None
-    step_s: float
+    sight: Sight
+    placed: Placed | None = None
+    step: Matrix | None = None
+    step_s: float = 0.0
 
     def predicted(self, time_s: float) -> Matrix:
         """keyframe_from_frame at a time, if the camera goes on as it went."""
         if self.step is None:
             return self.keyframe_from_frame
-        steps = (time_s - self.time_s) / self.step_s if self.step_s > 0 else 1.0
+        steps = (time_s - self.sight.time_s) / self.step_s if self.step_s > 0 else 1.0
         count = min(_MAX_STEPS_AHEAD, max(0, round(steps)))
         ahead = np.linalg.matrix_power(self.step, count)
         return geometry.normalized(self.keyframe_from_frame @ ahead)
@@ -107,20 +110,23 @@ class MovingCamera:
         self._references: dict[int, ReferenceView] = {}
         self._shear = ShearWatch()
         self._doubts = Doubts()
+        self._overlay = OverlayWatch()
         self._state: _State | None = None
 
     def update(self, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
         """The camera's pose in the next frame; targets' quads are left out of account."""
         self._loops.advance()
-        sight = Sight(view, _outlines(tracks, view.levels))
         state = self._state
+        if state is not None and view.levels.is_flat():
+            return CameraPose(None, reason=str(Verdict.TOO_FEW_FEATURES))
+        over = self._overlay.look(view.levels)
+        sight = Sight(view, _outlines(tracks, view.levels), over.quads, over.shown)
         if state is None:
             return self._begin(sight)
-        if view.levels.is_flat():
-            return CameraPose(None, reason=str(Verdict.TOO_FEW_FEATURES))
         placed = Placed(state.keyframe, self._follow(state, sight))
         if placed.keyframe_from_frame is None:
-            recognised = self._recognise(state, sight)
+            self._keep_last_view(state)
+            recognised = self._recognise(sight)
             if recognised is None:
                 return placed.refusal()
             placed = recognised
@@ -142,9 +148,16 @@ class MovingCamera:
         index = sight.index
         self._take(sight.view, reference, np.eye(3), None)
         self._shear.begin(index)
-        self._state = _State(index, np.eye(3), sight.levels, sight.time_s, None, 0.0)
+        self._state = _State(index, np.eye(3), sight)
         return CameraPose(
-            np.eye(3), cells, cells, 0.0, keyframe=index, is_keyframe=True, sigma_px=0.0
+            np.eye(3),
+            cells,
+            cells,
+            0.0,
+            keyframe=index,
+            is_keyframe=True,
+            sigma_px=0.0,
+            overlay=sight.overlay,
         )
 
     def _follow(self, state: _State, sight: Sight) -> ViewAlignment:
@@ -164,9 +177,18 @@ class MovingCamera:
         searched = _without_jump(searched, guess, size_wh)
         return found if searched.reference_from_view is None else searched
 
-    def _recognise(self, state: _State, sight: Sight) -> Placed | None:
+    def _keep_last_view(self, state: _State) -> None:
+        """The frame last placed becomes a keyframe, as it may show most of what a jump left."""
+        placed, sight = state.placed, state.sight
+        if placed is None or placed.overlap(sight) >= _MAX_LAST_OVERLAP:
+            return
+        if placed.found.inliers >= _MIN_LASTING_SHARE * len(placed.found.is_inlier):
+            self._extend(placed, sight, None)
+
+    def _recognise(self, sight: Sight) -> Placed | None:
         """The keyframe that a frame shows by its features, and the alignment that confirms it."""
-        for keyframe, guess in self._relocaliser.candidates(state.keyframe, sight.levels):
+        assert self._state is not None
+        for keyframe, guess in self._relocaliser.candidates(self._state.keyframe, sight):
             found = align(self._reference(keyframe), sight.levels, guess, sight.hidden)
             if found.reference_from_view is not None:
                 return Placed(keyframe, found)
@@ -182,11 +204,17 @@ class MovingCamera:
             return placed
         reference = self._reference(keyframe)
         layers = separated(reference, sight.levels, found, sight.hidden)
-        if layers.foreground:
-            outlines = (*reference.hidden, *layers.foreground)
-            self.graph.hide(keyframe, outlines)
-            self._keep_reference(keyframe, ReferenceView(reference.levels, outlines))
+        self._hide(keyframe, layers.foreground)
         return Placed(keyframe, layers.background)
+
+    def _hide(self, keyframe: int, outlines: Sequence[Points]) -> None:
+        """Leave what these quads hold out of a keyframe from now on."""
+        if not outlines:
+            return
+        reference = self._reference(keyframe)
+        reference = ReferenceView(reference.levels, (*reference.hidden, *outlines))
+        self.graph.hide(keyframe, reference.hidden)
+        self._keep_reference(keyframe, reference)
 
     def _accepted(self, placed: Placed, sight: Sight) -> CameraPose:
         """The pose of a frame in a keyframe; goes over to another one where that is better."""
@@ -200,6 +228,7 @@ class MovingCamera:
         if _stretch(world_from_frame, sight.size_wh) > _MAX_STRETCH:
             return placed.camera_pose(None, Verdict.STRETCHED)
         self.graph.add_frame(sight.index, keyframe, keyframe_from_frame)
+        self._hide(keyframe, self._overlay.note(sight.levels, world_from_frame))
         is_keyframe = False
         if self._has_moved_on(placed, sight):
             other = self._better_keyframe(placed, sight, world_from_frame)
@@ -211,27 +240,36 @@ class MovingCamera:
             world_from_frame = world_from_frame if moved is None else moved
         pose = placed.camera_pose(world_from_frame)
         sigma_px = hypot(self.graph.sigma_px(keyframe), found.corner_sigma_px)
-        return replace(pose, keyframe=keyframe, is_keyframe=is_keyframe, sigma_px=sigma_px)
+        return replace(
+            pose,
+            keyframe=keyframe,
+            is_keyframe=is_keyframe,
+            sigma_px=sigma_px,
+            overlay=sight.overlay,
+        )
 
     def _in_world(self, keyframe: int, keyframe_from_frame: Matrix) -> Matrix:
         world_from_keyframe = self.graph.keyframes[keyframe].world_from_keyframe
         return geometry.normalized(world_from_keyframe @ keyframe_from_frame)
 
     def _remember(self, placed: Placed, sight: Sight) -> None:
-        state, time_s = self._state, sight.time_s
+        state = self._state
         step, step_s = None, 0.0
-        if state is not None and state.keyframe == placed.keyframe and time_s > state.time_s:
+        is_later = state is not None and sight.time_s > state.sight.time_s
+        if state is not None and is_later and state.keyframe == placed.keyframe:
             motion = geometry.inverted(state.keyframe_from_frame) @ placed.pose
             quad = geometry.image_quad(sight.size_wh)
             step = fit(Model.SIMILARITY, quad, geometry.transform_points(motion, quad))
-            step_s = time_s - state.time_s
-        self._state = _State(placed.keyframe, placed.pose, sight.levels, time_s, step, step_s)
+            step_s = sight.time_s - state.sight.time_s
+        self._state = _State(placed.keyframe, placed.pose, sight, placed, step, step_s)
 
     def _go_over(self, keyframe: int, keyframe_from_frame: Matrix) -> None:
         """Go on from another keyframe; the motion from frame to frame stays."""
         state = self._state
         assert state is not None
-        self._state = replace(state, keyframe=keyframe, keyframe_from_frame=keyframe_from_frame)
+        self._state = replace(
+            state, keyframe=keyframe, keyframe_from_frame=keyframe_from_frame, placed=None
+        )
 
     def _has_moved_on(self, placed: Placed, sight: Sight) -> bool:
         found = placed.found
@@ -296,7 +334,7 @@ class MovingCamera:
             return reference
         here_from_before = geometry.inverted(placed.pose) @ before.keyframe_from_frame
         ours = replace(placed.found, reference_from_view=here_from_before)
-        layers = separated(reference, before.levels, ours, hidden)
+        layers = separated(reference, before.sight.levels, ours, hidden)
         if layers.background is not ours or not layers.foreground:
             return reference
         self._doubts.go_on(sight.index)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from streamtrack import geometry
 from streamtrack.camera.view_levels import ViewLevels
 from streamtrack.camera.view_verdict import ViewAlignment
@@ -14,10 +16,21 @@ from streamtrack.types import CameraPose, Matrix, Points, Size, Verdict
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """A frame, and quads (4, 2) in it that do not belong to the scene."""
+    """A frame, and quads (4, 2) in it that do not belong to the scene.
+
+    ``targets`` move by themselves, ``overlay`` lies over every picture; ``shown`` is the box
+    (x, y, w, h) of the picture within its bars.
+    """
 
     view: FrameView
-    hidden: Sequence[Points]
+    targets: Sequence[Points]
+    overlay: tuple[Points, ...]
+    shown: tuple[int, int, int, int]
+
+    @property
+    def hidden(self) -> tuple[Points, ...]:
+        """All that does not belong to the scene."""
+        return (*self.targets, *self.overlay)
 
     @property
     def index(self) -> int:
@@ -56,8 +69,9 @@ class Placed:
 
     def overlap(self, sight: Sight) -> float:
         """Share of the frame that the keyframe shows."""
-        quad = geometry.transform_points(self.pose, geometry.image_quad(sight.size_wh))
-        return geometry.visible_share(quad, sight.size_wh)
+        x, y, width, height = sight.shown
+        quad = geometry.transform_points(self.pose, geometry.box_quad(x, y, width - 1, height - 1))
+        return geometry.visible_share(quad - np.array([x, y], np.float32), (width, height))
 
     def camera_pose(
         self, world_from_frame: Matrix | None, why: Verdict | None = None

@@ -7,16 +7,19 @@ around it, then all others in an order that spreads over the whole flight.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+
+import numpy as np
 
 from streamtrack import geometry
 from streamtrack.camera.keyframes import KeyframeGraph
-from streamtrack.camera.view_levels import USUAL, ViewLevels
+from streamtrack.camera.placed import Sight
+from streamtrack.camera.view_levels import USUAL, ViewLevels, filled
 from streamtrack.features import FeatureExtractor
 from streamtrack.matching import match
 from streamtrack.registration import register
 from streamtrack.settings import FeatureSettings, Settings
-from streamtrack.types import Features, Matrix
+from streamtrack.types import Features, Matrix, Points
 
 _FEATURES = 500
 _KEYFRAMES_A_FRAME = 3
@@ -38,15 +41,15 @@ class Relocaliser:
         """The camera is found: the next search starts anew."""
         self._turn = 0
 
-    def candidates(self, last: int, levels: ViewLevels) -> Iterator[tuple[int, Matrix]]:
-        """(keyframe, keyframe_from_frame) of the keyframes whose features agree with a view's."""
+    def candidates(self, last: int, sight: Sight) -> Iterator[tuple[int, Matrix]]:
+        """(keyframe, keyframe_from_frame) of the keyframes whose features agree with a frame's."""
         chosen = self._chosen(last)
         self._turn += 1
-        seen = self._extracted(levels)
+        seen = self._extracted(sight.levels, sight.hidden)
         if len(seen) < self._settings.registration.min_inliers:
             return
         for keyframe in chosen:
-            guess = self._registered(seen, levels, keyframe)
+            guess = self._registered(seen, sight.levels, keyframe)
             if guess is not None:
                 yield keyframe, guess
 
@@ -65,7 +68,8 @@ class Relocaliser:
         """keyframe_from_frame by matched features."""
         there = self._features.get(keyframe)
         if there is None:
-            there = self._extracted(ViewLevels(self._graph.keyframes[keyframe].picture.grey()))
+            shown = self._graph.keyframes[keyframe]
+            there = self._extracted(ViewLevels(shown.picture.grey()), shown.hidden)
             self._features[keyframe] = there
             if len(self._features) > _FEATURES_KEPT:
                 self._features.popitem(last=False)
@@ -80,9 +84,13 @@ class Relocaliser:
         )
         return found.b_from_a
 
-    def _extracted(self, levels: ViewLevels) -> Features:
-        """Features of a view's usual level, in pixels of the view."""
+    def _extracted(self, levels: ViewLevels, hidden: Sequence[Points]) -> Features:
+        """Features of what is not hidden in a view's usual level, in pixels of the view."""
         found = self._extractor.extract(levels.usual)
+        if hidden:
+            covered = filled(hidden, levels.level_from_view(USUAL), levels.usual.shape)
+            columns, rows = np.rint(found.points).astype(np.intp).T
+            found = found[np.flatnonzero(~covered[rows, columns])]
         view_from_level = geometry.inverted(levels.level_from_view(USUAL))
         points = geometry.transform_points(view_from_level, found.points)
         return Features(points, found.sizes, found.responses, found.descriptors)

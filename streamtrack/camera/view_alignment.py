@@ -30,6 +30,7 @@ from streamtrack.camera.view_levels import (
     ReferenceView,
     ViewLevels,
     fill,
+    filled,
 )
 from streamtrack.camera.view_verdict import Fitted, ViewAlignment, judged, refusal
 from streamtrack.fitting import solved, step_matrix
@@ -78,7 +79,7 @@ def align(
     if judge_mapping(view_from_reference, geometry.image_quad(reference.size_wh)) is not Verdict.OK:
         return refusal(Verdict.PERSPECTIVE)
     if is_searched:
-        view_from_reference = _shifted(reference, view, view_from_reference)
+        view_from_reference = _shifted(reference, view, view_from_reference, hidden)
     coarsest = min(len(reference.levels.images), len(view.images)) - 1
     return _descended(reference, view, view_from_reference, hidden, coarsest)
 
@@ -177,14 +178,19 @@ def _stiffened(
     return stiff if stiff.verdict is Verdict.OK and is_as_good else found
 
 
-def _shifted(reference: ReferenceView, view: ViewLevels, view_from_reference: Matrix) -> Matrix:
+def _shifted(
+    reference: ReferenceView,
+    view: ViewLevels,
+    view_from_reference: Matrix,
+    hidden: Sequence[Points],
+) -> Matrix:
     """The guess after the shift under which the middle of the overlap correlates best.
 
     At the coarsest level: the view is warped as the guess has it, and the middle of the
     reference is looked for in it.
     """
     level = min(len(reference.levels.images), len(view.images)) - 1
-    wanted = reference.levels.high_passed(level)
+    wanted = _shown(reference.levels, level, reference.hidden)
     height, width = wanted.shape
     to_reference, to_view = reference.levels.level_from_view(level), view.level_from_view(level)
     mapping = to_view @ view_from_reference @ geometry.inverted(to_reference)
@@ -192,7 +198,7 @@ def _shifted(reference: ReferenceView, view: ViewLevels, view_from_reference: Ma
     # A wider warp: what the reference's frame would see with a border all round.
     size = width + 2 * reach_x, height + 2 * reach_y
     wide = cv2.warpPerspective(
-        view.high_passed(level),
+        _shown(view, level, hidden),
         mapping @ geometry.translation(-reach_x, -reach_y),
         size,
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
@@ -210,6 +216,15 @@ def _shifted(reference: ReferenceView, view: ViewLevels, view_from_reference: Ma
     shift = geometry.translation(float(x) - reach_x, float(y) - reach_y)
     moved = geometry.inverted(to_view) @ mapping @ shift @ to_reference
     return geometry.normalized(moved)
+
+
+def _shown(levels: ViewLevels, level: int, hidden: Sequence[Points]) -> Floats:
+    """The high-passed level, empty where quads (4, 2) of the view hide the scene."""
+    values = levels.high_passed(level)
+    if not hidden:
+        return values
+    covered = filled(hidden, levels.level_from_view(level), values.shape)
+    return np.where(covered, np.float32(0), values)
 
 
 def _fit(

@@ -132,7 +132,7 @@ class StreamMosaic(Closing):
     def add(self, frame: Frame, pose: CameraPose, tracks: Sequence[Track] = ()) -> str:
         """Take in the next frame; returns why it has no place in the mosaic, or an empty string.
 
-        What lies on ``tracks`` (targets) is not painted. A frame without a pose has no place, for
+        What lies on ``tracks`` (targets) or over every picture is not painted. A frame without a pose has no place, for
         the camera's reason.
         """
         self._moment += 1
@@ -140,7 +140,8 @@ class StreamMosaic(Closing):
         world_from_frame = pose.world_from_frame
         reason = pose.reason or "its pose is not known"
         if world_from_frame is not None:
-            reason = self._place(frame, world_from_frame, painting.target_quads(tracks))
+            hidden = (*painting.target_quads(tracks), *pose.overlay)
+            reason = self._place(frame, world_from_frame, hidden)
         else:
             self._keep_waiting()
             if self._store is not None:

@@ -125,7 +125,7 @@ class OverlayWatch:
         stayed = gx * now[0] + gy * now[1] >= _MIN_ALIKE * size * size_now
         stayed &= (_MOST_CHANGE * size_now >= size) & (size_now <= _MOST_CHANGE * size)
         votes += should_go & stayed
-        votes -= 2 * (should_go & ~stayed).view(np.int8)
+        votes -= should_go & ~stayed
         np.clip(votes, 0, _MOST_VOTES, out=votes)
         for kept, seen in zip(self._gradient, now, strict=True):
             np.copyto(kept, seen, where=votes == 0)

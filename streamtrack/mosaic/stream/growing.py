@@ -132,8 +132,8 @@ class StreamMosaic(Closing):
     def add(self, frame: Frame, pose: CameraPose, tracks: Sequence[Track] = ()) -> str:
         """Take in the next frame; returns why it has no place in the mosaic, or an empty string.
 
-        What lies on ``tracks`` (targets) or over every picture is not painted. A frame without a pose has no place, for
-        the camera's reason.
+        What lies on ``tracks`` (targets) or over every picture is not painted. A frame without a
+        pose has no place, for the camera's reason.
         """
         self._moment += 1
         self._outline = None

@@ -13,7 +13,7 @@ Scenes: those of bench_world.py without their targets, and
 A pixel is off if it differs from the true ground by more than 20 grey levels, both averaged over
 3 x 3 pixels, and by more than the ground itself varies within a pixel; the mosaic is
 laid on the ground by its own poses, whose mean error is printed. What stands throughout counts
-neither way. ``--targets`` gives the cars' first quads of bench_world's scenes to the tracker.
+neither way. ``--auto`` has moving things found and left out as targets.
 """
 
 from __future__ import annotations

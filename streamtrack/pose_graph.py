@@ -37,12 +37,12 @@ class ExpectedDrift:
 
     @classmethod
     def of(cls, graph: _Drifting | None) -> ExpectedDrift | None:
-        """None without keyframes, or as long as nothing is known of them."""
+        """None as long as nothing is known of any keyframe but the first, which cannot drift."""
         if graph is None:
             return None
         sigmas = [graph.sigma_px(index) for index in graph.keyframes]
         known = [sigma for sigma in sigmas if isfinite(sigma)]
-        return cls(known[-1], max(known)) if known else None
+        return cls(known[-1], max(known)) if len(known) > 1 else None
 
     def to_json(self) -> dict[str, float]:
         return {"end": round(self.end_px, 3), "most": round(self.most_px, 3)}

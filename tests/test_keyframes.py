@@ -12,6 +12,7 @@ from streamtrack import geometry
 from streamtrack.camera.keyframes import KeyframeGraph
 from streamtrack.errors import OutputError
 from streamtrack.mosaic.types import Link
+from streamtrack.pose_graph import ExpectedDrift
 from streamtrack.types import Image, Matches, Model, Registration, Verdict
 
 SIZE = (160, 120)
@@ -144,3 +145,28 @@ def test_pictures_beyond_the_limit_lie_in_a_file(make_picture: MakePicture) -> N
     np.testing.assert_array_equal(graph.keyframes[0].image(), first)
     with pytest.raises((OutputError, OSError)):
         graph.keyframes[50].image()
+
+
+class Sigmas:
+    """What is known of keyframes by their numbers."""
+
+    def __init__(self, sigmas: dict[int, float]) -> None:
+        self.keyframes = sigmas
+
+    def sigma_px(self, index: int) -> float:
+        return self.keyframes[index]
+
+
+@pytest.mark.parametrize(
+    ("sigmas", "end", "most"),
+    [({0: 0.0, 4: 2.0, 9: 1.0}, 1.0, 2.0), ({0: 0.0, 4: 2.0, 9: float("nan")}, 2.0, 2.0)],
+)
+def test_the_drift_told_is_that_of_the_last_known_keyframe(
+    sigmas: dict[int, float], end: float, most: float
+) -> None:
+    assert ExpectedDrift.of(Sigmas(sigmas)) == ExpectedDrift(end, most)
+
+
+@pytest.mark.parametrize("sigmas", [{}, {0: 0.0}, {0: 0.0, 3: float("nan")}])
+def test_no_drift_is_told_of_what_is_not_known(sigmas: dict[int, float]) -> None:
+    assert ExpectedDrift.of(Sigmas(sigmas)) is None

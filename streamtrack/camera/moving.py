@@ -293,6 +293,8 @@ class MovingCamera:
             found = align(self._reference(other), sight.levels, guess, sight.hidden)
             if found.reference_from_view is not None:
                 self._go_over(other, found.reference_from_view)
+                other_from_frame = self.graph.lens.flat(found, sight.size_wh)
+                self.graph.add_frame(sight.index, other, other_from_frame)
                 return other
         return None
 

@@ -104,7 +104,9 @@ def track(
         Path | None,
         typer.Option(help="Table of tracks: .csv, .jsonl, .parquet, or .txt (MOT)."),
     ] = None,
-    poses: Annotated[Path | None, typer.Option(help="CSV of the camera's poses.")] = None,
+    poses: Annotated[
+        Path | None, typer.Option(help="CSV of the camera's poses, each with the error to expect.")
+    ] = None,
     video: Annotated[
         Path | None, typer.Option(help="Annotated copy: .mp4, .mkv, .webm, .avi.")
     ] = None,

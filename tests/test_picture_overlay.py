@@ -16,8 +16,10 @@ from streamtrack.evaluation import corner_error
 from streamtrack.features import FeatureExtractor
 from streamtrack.frame_view import FrameView
 from streamtrack.mosaic.stream.growing import StreamMosaic
+from streamtrack.pipeline import track
 from streamtrack.settings import build_settings
-from streamtrack.types import CameraPose, Image, Mask
+from streamtrack.targets import parse_targets
+from streamtrack.types import CameraPose, Image, Mask, TrackState
 
 MakeClip = Callable[..., Clip]
 FLIGHT = "flight?size=320x240&frames=40&step=12"
@@ -100,3 +102,16 @@ def test_the_mosaic_shows_the_scene_alone(
     assert both.mean() > 0.4
     off = np.abs(plain.astype(int) - found).max(axis=2)[both] > 60
     assert off.mean() < 0.02
+
+
+@pytest.mark.parametrize("change", [letterboxed, titled])
+def test_it_is_nothing_that_moves_by_itself(
+    change: Callable[[Image], Image], make_clip: MakeClip
+) -> None:
+    """Against a ground that moves, what stands in the picture would seem to."""
+    clip = make_clip(FLIGHT, FRAMES)
+    images = {frame.index: change(frame.image) for frame in clip.frames}
+    settings = build_settings({"camera": "moving"})
+    steps = list(track(clip.with_images(images), parse_targets(["auto"]), settings))
+    seen = [t for step in steps[12:] for t in step.tracks if t.state is TrackState.TRACKING]
+    assert seen == []

@@ -13,6 +13,7 @@ gradually over the picture, changes the background with it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias, TypeVar
 
@@ -21,7 +22,8 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.types import Image, Mask, Matrix, Size
+from streamtrack.camera.view_levels import filled
+from streamtrack.types import Image, Mask, Matrix, Points, Size
 
 Floats: TypeAlias = npt.NDArray[np.float32]
 _Number = TypeVar("_Number", bound=np.generic)
@@ -96,12 +98,21 @@ class BackgroundModel:
         self._seen_before: Mask = np.zeros((height, width), np.bool_)
 
     def compare(
-        self, small: Image, world_from_small: Matrix, small_from_frame: Matrix
+        self,
+        small: Image,
+        world_from_small: Matrix,
+        small_from_frame: Matrix,
+        overlay: Sequence[Points],
     ) -> Outstanding:
-        """What stands out in a reduced frame (h, w, 3) whose place in the world is given."""
+        """What stands out in a reduced frame (h, w, 3) whose place in the world is given.
+
+        Quads (4, 2) of the frame that lie over every picture show nothing of the scene.
+        """
         grid_from_small = self._follow(world_from_small)
         small = np.asarray(cv2.GaussianBlur(small, (3, 3), 0), np.uint8)
         image, seen = self._in_grid(small, grid_from_small)
+        if overlay:
+            seen &= ~filled(overlay, grid_from_small @ small_from_frame, seen.shape)
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
         known = seen & (self._age >= _KNOWN_AGE)
         relit = self._relit(grey, known)

@@ -50,6 +50,7 @@ from streamtrack.types import (
     Mask,
     Matrix,
     Model,
+    Points,
     Size,
     Track,
     TrackState,
@@ -120,10 +121,10 @@ class AutoTargets:
         )
         if self._background is None or self._background.size_wh != size_wh:
             self._background = BackgroundModel(size_wh, world_from_small)
-        seen = self._background.compare(small, world_from_small, small_from_frame)
+        seen = self._background.compare(small, world_from_small, small_from_frame, pose.overlay)
         turn = self._predict(world_from_frame, view.frame.time_s, view.size_wh)
         if not seen.is_explained:
-            return self._broken_off(world_from_small, small, small_from_frame)
+            return self._broken_off(world_from_small, small, small_from_frame, pose.overlay)
         self._broken = 0
         motion = self._field.measure(seen)
         moving, changing = moving_pixels(seen, motion)
@@ -293,7 +294,11 @@ class AutoTargets:
         return self._tracks()
 
     def _broken_off(
-        self, world_from_small: Matrix, small: Image, small_from_frame: Matrix
+        self,
+        world_from_small: Matrix,
+        small: Image,
+        small_from_frame: Matrix,
+        overlay: Sequence[Points],
     ) -> list[Track]:
         """Most of the picture changed at once: a flash, or another scene if it stays so."""
         self._broken += 1
@@ -301,7 +306,7 @@ class AutoTargets:
             return self._blind("most of the picture changed at once")
         self._things, self._broken = [], 0
         self._background = BackgroundModel((small.shape[1], small.shape[0]), world_from_small)
-        seen = self._background.compare(small, world_from_small, small_from_frame)
+        seen = self._background.compare(small, world_from_small, small_from_frame, overlay)
         nothing = np.zeros(seen.clear.shape, np.bool_)
         self._background.learn(seen, nothing, nothing)
         return []

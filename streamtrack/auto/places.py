@@ -13,8 +13,9 @@ import numpy.typing as npt
 from streamtrack import geometry
 from streamtrack.auto.background import Outstanding
 from streamtrack.auto.blobs import Scene
+from streamtrack.camera.view_levels import filled
 from streamtrack.frame_view import FrameView
-from streamtrack.types import Image, Mask, Matrix, Points, Size, Track
+from streamtrack.types import Image, Mask, Matrix, Size, Track
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
@@ -105,18 +106,6 @@ def hidden_by(seen: Outstanding, given: Sequence[Track]) -> Mask:
             middle = track.quad.mean(axis=0)
             quads.append(middle + np.float32(1.15) * (track.quad - middle))
     return filled(quads, seen.grid_from_frame, seen.clear.shape)
-
-
-def filled(quads: Sequence[Points], grid_from_frame: Matrix, shape: tuple[int, ...]) -> Mask:
-    """Which pixels (h, w) of the grid lie in quads (4, 2) of the frame."""
-    mask = np.zeros(shape, np.uint8)
-    if not quads:
-        return mask > 0
-    corners = geometry.transform_points(grid_from_frame, np.concatenate(quads)).reshape(-1, 4, 2)
-    corners = corners[np.isfinite(corners).all(axis=(1, 2))]
-    for outline in np.rint(np.clip(corners, -1e5, 1e5)).astype(np.int32):
-        cv2.fillConvexPoly(mask, outline, 1)
-    return mask > 0
 
 
 def motion_within(scene: Scene, box: Doubles) -> tuple[Doubles, float] | None:

@@ -35,13 +35,13 @@ from streamtrack.auto.followed import Followed, Life, predict_all
 from streamtrack.auto.places import (
     REST_PX,
     Moment,
-    filled,
     hidden_by,
     is_invertible,
     moving_pixels,
     reduced,
     resting_share,
 )
+from streamtrack.camera.view_levels import filled
 from streamtrack.frame_view import FrameView
 from streamtrack.pyramid import Pyramid
 from streamtrack.types import (

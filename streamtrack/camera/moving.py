@@ -182,7 +182,7 @@ class MovingCamera:
         placed, sight = state.placed, state.sight
         if placed is None or placed.overlap(sight) >= _MAX_LAST_OVERLAP:
             return
-        if placed.found.inliers >= _MIN_LASTING_SHARE * len(placed.found.is_inlier):
+        if _is_lasting(placed.found):
             self._extend(placed, sight, None)
 
     def _recognise(self, sight: Sight) -> Placed | None:
@@ -275,8 +275,7 @@ class MovingCamera:
         found = placed.found
         if found.inliers < _MIN_AGREEING_CELLS or placed.overlap(sight) < _MIN_OVERLAP:
             return True
-        has_changed = found.inliers < _MIN_LASTING_SHARE * len(found.is_inlier)
-        has_changed |= found.corner_sigma_px > _MAX_LASTING_SIGMA_PX
+        has_changed = not _is_lasting(found) or found.corner_sigma_px > _MAX_LASTING_SIGMA_PX
         return has_changed and sight.index >= placed.keyframe + _MIN_SPACING
 
     def _better_keyframe(
@@ -371,6 +370,11 @@ def _outlines(tracks: Sequence[Track], levels: ViewLevels) -> list[Points]:
     """The targets' quads with a margin: what moves tinges the local means of what is next to it."""
     margin_px = _MARGIN_PX * levels.size_wh[0] / levels.usual.shape[1]
     return [geometry.grown_quad(t.quad, margin_px) for t in tracks if t.quad is not None]
+
+
+def _is_lasting(found: ViewAlignment) -> bool:
+    """Is most of what a keyframe showed still there?"""
+    return found.inliers >= _MIN_LASTING_SHARE * len(found.is_inlier)
 
 
 def _without_jump(found: ViewAlignment, guess: Matrix, size_wh: Size) -> ViewAlignment:

@@ -17,12 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.camera.view_levels import USUAL, ViewLevels
+from streamtrack.camera.view_levels import USUAL, Floats, ViewLevels, gradient
 from streamtrack.types import Image, Mask, Matrix, Points
 
-Floats: TypeAlias = npt.NDArray[np.float32]
-Gradient: TypeAlias = tuple[Floats, Floats]
-"""Grey levels a pixel along x and y, (h, w) each."""
+Vectors: TypeAlias = tuple[Floats, Floats]
+"""Along x and y, (h, w) each."""
 Margins: TypeAlias = tuple[int, int, int, int]
 """Black rows above and below, black columns left and right, of the usual level."""
 
@@ -58,7 +57,7 @@ class OverlayWatch:
         self._margins: Margins | None = None
         self._frames = self._looks = 0
         self._last: Matrix | None = None
-        self._gradient: Gradient | None = None
+        self._gradient: Vectors | None = None
         self._votes: npt.NDArray[np.int8] | None = None
         self._is_over: Mask | None = None
         self._edges: tuple[Points, ...] = ()
@@ -101,17 +100,17 @@ class OverlayWatch:
         if not _typical_motion_px(motion, self._votes.shape) >= _MIN_MOTION_PX:
             return ()
         self._looks += 1
-        self._vote(_gradient(levels.usual), motion)
+        self._vote(gradient(levels.usual), motion)
         self._last = world_from_frame
         return self._judge(levels)
 
     def _begin(self, levels: ViewLevels, world_from_frame: Matrix) -> None:
         self._last = world_from_frame
-        self._gradient = _gradient(levels.usual)
+        self._gradient = gradient(levels.usual)
         self._votes = np.zeros(levels.usual.shape, np.int8)
         self._is_over = np.zeros(levels.usual.shape, bool)
 
-    def _vote(self, now: Gradient, motion: Matrix) -> None:
+    def _vote(self, now: Vectors, motion: Matrix) -> None:
         """For edges that stayed although they should have moved, against those that went.
 
         An edge is compared with how it was when it got its first vote.
@@ -147,13 +146,7 @@ class OverlayWatch:
         return self._edges if has_more else ()
 
 
-def _gradient(image: Image) -> Gradient:
-    gx = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
-    gy = cv2.Sobel(image, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
-    return np.asarray(gx, np.float32), np.asarray(gy, np.float32)
-
-
-def _motion_field(motion: Matrix, shape: tuple[int, ...]) -> Gradient:
+def _motion_field(motion: Matrix, shape: tuple[int, ...]) -> Vectors:
     """How far each pixel moves along x and y, (h, w) each."""
     x = np.arange(shape[1], dtype=np.float32)
     y = np.arange(shape[0], dtype=np.float32)[:, None]

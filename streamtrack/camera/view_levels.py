@@ -152,12 +152,18 @@ def fill(picture: Image, quads: Sequence[Points], picture_from_view: Matrix, val
             cv2.fillConvexPoly(picture, np.rint(np.clip(seen, -1e6, 1e6)).astype(np.int32), value)
 
 
+def gradient(values: Floats | Image) -> tuple[Floats, Floats]:
+    """Change of values (h, w) a pixel along x and y, (h, w) each."""
+    gx = cv2.Sobel(values, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
+    gy = cv2.Sobel(values, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
+    return np.asarray(gx, np.float32), np.asarray(gy, np.float32)
+
+
 def _choose_pixels(
     levels: ViewLevels, level: int, hidden: Sequence[Points], masked: Mask | None
 ) -> Pixels:
     values = levels.high_passed(level)
-    gx = np.asarray(cv2.Sobel(values, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8), np.float32)
-    gy = np.asarray(cv2.Sobel(values, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8), np.float32)
+    gx, gy = gradient(values)
     strength = np.asarray(gx * gx + gy * gy, np.float32)
     edge = EDGE_PX[level]
     strength[:edge] = strength[-edge:] = 0
@@ -176,7 +182,7 @@ def _choose_pixels(
     places = row * width + column
     points = np.stack([column, row, np.ones_like(row)]).astype(np.float32)
     x, y, _ = unit_from_level.astype(np.float32) @ points
-    u, v = (gradient.take(places) / unit for gradient in (gx, gy))
+    u, v = (along.take(places) / unit for along in (gx, gy))
     radial = u * x + v * y
     jacobian = np.stack([u * x, u * y, u, v * x, v * y, v, -x * radial, -y * radial])
     return Pixels(points, values.take(places), jacobian, cell, unit_from_level)

@@ -1,13 +1,13 @@
 """The video held still: each frame warped to a smoothed path of the camera, or to the fixed world.
 
-`SmoothView` looks a moment ahead and follows the camera's mean motion; its pictures are cropped a
-little and never show anything beyond a frame's edge. `WorldView` shows the place that the first
-frame showed, for as long as the camera looks there. Both give one picture a frame, at its time.
+`SmoothView` looks a moment ahead and follows the camera's way without its shaking; its pictures are
+cropped a little and never show anything beyond a frame's edge. `WorldView` shows the place that the
+first frame showed, for as long as the camera looks there. Both give one picture a frame, at its
+time.
 """
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,7 +20,8 @@ import numpy.typing as npt
 from streamtrack import geometry
 from streamtrack.mosaic.stream.painting import refusal
 from streamtrack.settings import StabilizeSettings
-from streamtrack.types import Image, Matrix, Points, Size, Step
+from streamtrack.steady_path import Room, frames_before_a_cut, steadiest_views
+from streamtrack.types import Image, Matrix, Size, Step
 
 if TYPE_CHECKING:
     from streamtrack.pose_graph import PoseGraph
@@ -28,7 +29,8 @@ if TYPE_CHECKING:
 _CROP = 0.06
 """Share of the picture's sides that is given up on each side, to have room to move in."""
 _MOST_HELD_MB = 192.0
-_SIGMA_OF_REACH = 0.45
+_BEND = 0.375  # of the reach: what lasts much less than that is shaking
+_PAST = 2  # frames shown, which are where a path sets out from, and whereto
 _DIMMED = 0.35
 _FARTHEST_PX = 1e6
 
@@ -36,10 +38,14 @@ Doubles = npt.NDArray[np.float64]
 
 
 class Shown(NamedTuple):
-    """One picture of a stabilised video, and the time of its frame."""
+    """One picture of a stabilised video, and the time of its frame.
+
+    ``shown_from_frame`` takes the frame's pixels to the picture's; None if its place is not known.
+    """
 
     image: Image
     time_s: float
+    shown_from_frame: Matrix | None = None
 
 
 class Stabilizer(Protocol):
@@ -82,7 +88,9 @@ class WorldView:
         size_wh = seen.shape[1], seen.shape[0]
         shown = cv2.convertScaleAbs(seen, alpha=_DIMMED)
         pose = step.camera.world_from_frame
-        if pose is not None and not refusal(pose, step.frame.size_wh, _FARTHEST_PX):
+        if pose is not None and refusal(pose, step.frame.size_wh, _FARTHEST_PX):
+            pose = None
+        if pose is not None:
             warped = cv2.warpPerspective(bgr, pose, size_wh)
             full = np.full(image.shape[:2], 255, np.uint8)
             inside = cv2.inRange(cv2.warpPerspective(full, pose, size_wh), 255, 255)
@@ -91,7 +99,7 @@ class WorldView:
             self.unplaced += not cv2.countNonZero(inside)
         else:
             self.unplaced += 1
-        yield Shown(np.asarray(shown, np.uint8), step.frame.time_s)
+        yield Shown(np.asarray(shown, np.uint8), step.frame.time_s, pose)
 
     def finish(self) -> Iterator[Shown]:
         return iter(())
@@ -99,21 +107,22 @@ class WorldView:
 
 @dataclass(slots=True, eq=False)
 class _Held:
-    """A frame, its pose as given, and its picture until it was shown."""
+    """A frame, its pose as given, its picture until it was shown, and then what was shown of it."""
 
     index: int
     time_s: float
     size_wh: Size
     pose: Matrix | None
     image: Image | None
+    view: Doubles | None = None
 
 
 class SmoothView:
-    """What a camera would show that moves as this one does on average.
+    """What a camera would show that moves as this one does without its shaking.
 
-    Each picture shows the weighted mean of the views within ``reach_s`` seconds before and after
-    its frame, by their corners (Gaussian weights). Where that would leave the frame, only as much
-    of the way is gone as stays in it. A frame whose pose is not known is shown as it is.
+    Each picture shows the view of its frame on the steadiest path (`steady_path`) that stays within
+    the frames, by the poses up to ``reach_s`` seconds ahead. A frame whose pose is not known is
+    shown with what the frames around it were moved by, the less the longer ago that was.
 
     ``graph`` has poses that may still change.
     """
@@ -146,60 +155,66 @@ class SmoothView:
         held = self._held[self._next]
         image, held.image = held.image, None
         assert image is not None
-        quad = self._view(held)
         while self._held[0].time_s < held.time_s - self._reach_s:
             self._held.popleft()
             self._next -= 1
-        self._next += 1
-        if quad is None:
+        if held.pose is None:
             self.unplaced += 1
-            quad = _shrunk(geometry.image_quad(held.size_wh).astype(np.float64))
-        shown_from_frame = geometry.quad_mapping(quad, geometry.image_quad(held.size_wh))
+            view = self._view_in_gap(held)
+        else:
+            view = held.view = self._view_on_path(held)
+        self._next += 1
+        shown_from_frame = geometry.quad_mapping(view, geometry.image_quad(held.size_wh))
         shown = cv2.warpPerspective(
             image, shown_from_frame, held.size_wh, borderMode=cv2.BORDER_REPLICATE
         )
-        return Shown(np.asarray(shown, np.uint8), held.time_s)
+        return Shown(np.asarray(shown, np.uint8), held.time_s, shown_from_frame)
 
-    def _view(self, held: _Held) -> Doubles | None:
-        """What to show: a quad (4, 2) in the frame, None if the frame's pose is not known."""
-        pose = self._pose(held)
-        if pose is None:
-            return None
-        frame_from_world = geometry.inverted(pose)
-        sigma = max(_SIGMA_OF_REACH * self._reach_s, 1e-9)
-        corners = geometry.image_quad(held.size_wh)
-        total, weights = np.zeros((4, 2)), 0.0
-        for other in self._held:
-            there = self._pose(other)
-            if there is None or other.size_wh != held.size_wh:
-                continue
-            quad = geometry.transform_points(frame_from_world @ there, corners)
-            if not np.isfinite(quad).all() or abs(other.time_s - held.time_s) > self._reach_s:
-                continue
-            weight = math.exp(-0.5 * ((other.time_s - held.time_s) / sigma) ** 2)
-            total += weight * quad
-            weights += weight
-        return _kept_inside(total / weights, corners)
+    def _view_on_path(self, here: _Held) -> Doubles:
+        """The view (4, 2) of a frame that has a pose, in its own pixels."""
+        room = Room(here.size_wh, _CROP)
+        past = [held for held in self._held if held.view is not None and held.time_s < here.time_s]
+        coming = [held for held in self._held if held.pose is not None and held.view is None]
+        behind, matrices_behind = self._in_one_piece([here, *past[: -_PAST - 1 : -1]], room)
+        ahead, matrices_ahead = self._in_one_piece(coming[coming.index(here) :], room)
+        matrices = np.concatenate([matrices_behind[:0:-1], matrices_ahead])
+        shown = np.array([held.view for held in behind[:0:-1]]).reshape(-1, 4, 2)
+        times_s = np.array([held.time_s for held in (*behind[:0:-1], *ahead)])
+        views = steadiest_views(times_s, matrices, shown, room, _BEND * self._reach_s)
+        return np.asarray(views[0])
 
-    def _pose(self, held: _Held) -> Matrix | None:
-        """The pose by what is known now."""
-        if held.pose is None or self._graph is None:
-            return held.pose
-        known = self._graph.world_from_frame(held.index)
+    def _in_one_piece(self, frames: list[_Held], room: Room) -> tuple[list[_Held], Doubles]:
+        """Those that lie together with the first, within reach; the first's pixels from theirs."""
+        first = frames[0]
+        frame_from_world = geometry.inverted(self._pose(first))
+        near = [
+            held
+            for held in frames
+            if held.size_wh == first.size_wh and abs(held.time_s - first.time_s) <= self._reach_s
+        ]
+        matrices = np.array([frame_from_world @ self._pose(held) for held in near])
+        count = frames_before_a_cut(matrices, room.own)
+        return near[:count], matrices[:count]
+
+    def _view_in_gap(self, here: _Held) -> Doubles:
+        """The view (4, 2) of a frame without a pose: as the nearest ones with a pose are moved."""
+        own = Room(here.size_wh, _CROP).own
+        known = [
+            held for held in self._held if held.pose is not None and held.size_wh == here.size_wh
+        ]
+        before = [held for held in known if held.view is not None][-1:]
+        after = [held for held in known if held.view is None][:1]
+        fade_s = self._reach_s
+        if before and after:
+            fade_s = min(fade_s, after[0].time_s - before[0].time_s)
+        view = own.copy()
+        for held in (*before, *after):
+            shown = self._view_on_path(held) if held.view is None else held.view
+            view += max(0.0, 1 - abs(held.time_s - here.time_s) / fade_s) * (shown - own)
+        return view
+
+    def _pose(self, held: _Held) -> Matrix:
+        """The pose, of a frame that has one, by what is known now."""
+        assert held.pose is not None
+        known = None if self._graph is None else self._graph.world_from_frame(held.index)
         return held.pose if known is None else known
-
-
-def _shrunk(quad: Doubles) -> Doubles:
-    middle = quad.mean(axis=0)
-    return np.asarray(middle + (1 - 2 * _CROP) * (quad - middle), np.float64)
-
-
-def _kept_inside(wanted: Doubles, corners: Points) -> Doubles:
-    """The wanted view, cropped, as far from the frame's own as it stays in the frame."""
-    own = _shrunk(corners.astype(np.float64))
-    way = _shrunk(wanted) - own
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        room = np.where(way > 0, (high - own) / way, (low - own) / way)
-    share = min(1.0, float(np.min(np.where(way == 0, np.inf, room))))
-    return np.asarray(own + share * way, np.float64)

@@ -124,9 +124,9 @@ def track(
     stabilize_path: Annotated[
         str | None,
         typer.Option(
-            help="smooth (default): follows the camera's mean motion, cropped by 6 per cent a "
-            "side, frames without a pose as they are; world: the place that the first frame "
-            "showed, what a frame does not reach darkened, as it was seen last.",
+            help="smooth (default): the camera's way without its shaking, cropped by 6 per cent a "
+            "side; world: the place that the first frame showed, what a frame does not reach "
+            "darkened, as it was seen last.",
         ),
     ] = None,
     live: Annotated[

@@ -25,7 +25,7 @@ from streamtrack.sources import open_source
 from streamtrack.sources.base import FrameSource
 from streamtrack.sources.live_status import LiveStatus
 from streamtrack.summary import Summary, SummaryBuilder
-from streamtrack.targets import TargetSpec, given_targets
+from streamtrack.targets import TargetSpec, auto_target, given_targets
 from streamtrack.types import Skipped, SourceInfo, Step
 from streamtrack.watching import Outputs, RunSummary, Watchers, live_source, open_watchers
 from streamtrack.working_size import graph_in_full_size
@@ -141,7 +141,16 @@ def run(
         if first is None:
             raise SourceError(f"{source.info.name}: no frame could be read")
         views = {target.name: target.picture for target in given_targets(job.targets)}
-        open_watchers(watchers, job.outputs, source, job.settings, views, camera, stack)
+        open_watchers(
+            watchers,
+            job.outputs,
+            source,
+            job.settings,
+            views,
+            camera,
+            stack,
+            auto_target(job.targets) is not None,
+        )
         progress.begin(source.info, _expected_frames(job, source.info))
         service.ready(f"following {source.info.name}")
         error: StreamtrackError | None = None

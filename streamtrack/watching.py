@@ -142,8 +142,11 @@ def open_watchers(
     views: Mapping[str, Image | None],
     camera: CameraEstimator,
     stack: ExitStack,
+    finds_targets: bool = False,
 ) -> None:
     """Open every output that is wanted; ``views`` holds each target's template picture or None.
+
+    ``finds_targets`` where more of them may come by themselves.
 
     Raises OutputError.
     """
@@ -161,7 +164,7 @@ def open_watchers(
     graph = graph_in_full_size(camera.graph, info.size_wh, settings.max_width)
     if outputs.stabilized is not None:
         _add_stabilized(outputs.stabilized, info, settings, graph, stack, result)
-    displays = _open_displays(outputs, info, settings, views, stack, result)
+    displays = _open_displays(outputs, info, settings, views, finds_targets, stack, result)
     result.watchers.extend(display.log for display in displays)
     result.watchers.append(_camera_watcher(settings))
     if outputs.has_mosaic:
@@ -208,13 +211,14 @@ def _open_displays(
     info: SourceInfo,
     settings: Settings,
     views: Mapping[str, Image | None],
+    finds_targets: bool,
     stack: ExitStack,
     result: Watchers,
 ) -> list[Recorder | LiveView]:
     """The recording and the live view: both take the same."""
     displays: list[Recorder | LiveView] = []
     pictures = {name: picture for name, picture in views.items() if picture is not None}
-    about = (info, settings, list(views), pictures, outputs.has_mosaic)
+    about = (info, settings, list(views), pictures, outputs.has_mosaic, finds_targets)
     if outputs.record is not None:
         from streamtrack.recording.recorder import Recorder
 

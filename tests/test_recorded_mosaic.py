@@ -49,10 +49,10 @@ def mosaic_view(width=400, shift=0.0, edges=(), names=()):
     return MosaicView(preview, world_from_preview, None, keyframes(shift), edges, names)
 
 
-def square_from_world():
-    """The preview of 400 x 200 fills a square of 768 from side to side."""
+def framed_from_world():
+    """The preview of 400 x 200 fills the 1024 x 576 from side to side."""
     preview_from_world = np.linalg.inv(translation(-10, -20) @ scaling(2.0))
-    return translation(0, (768 - 384) / 2) @ scaling(1.92) @ preview_from_world
+    return translation(0, (576 - 512) / 2) @ scaling(2.56) @ preview_from_world
 
 
 class Graph:
@@ -138,7 +138,7 @@ def test_entities_of_the_mosaic_are_there(recorded):
 def test_the_picture_comes_once_a_second_and_at_the_end(recorded):
     frames, pictures = rrd_columns(recorded, "/mosaic/image", BLOB)
     assert frames == [0, 25, 50, 59]
-    assert cv2.imdecode(np.frombuffer(blob(pictures[0]), np.uint8), 1).shape == (768, 768, 3)
+    assert cv2.imdecode(np.frombuffer(blob(pictures[0]), np.uint8), 1).shape == (576, 1024, 3)
 
 
 def test_the_frame_lies_where_it_was_placed(recorded):
@@ -146,13 +146,13 @@ def test_the_frame_lies_where_it_was_placed(recorded):
     outlines = dict(zip(frames, outlines, strict=True))
     assert frames == [*range(1, 11), *range(15, 60)]
     assert outlines[10] == []  # lost: nothing is drawn
-    expected = transform_points(square_from_world() @ pose(30), FRAME)
+    expected = transform_points(framed_from_world() @ pose(30), FRAME)
     np.testing.assert_allclose(outlines[30][0][:4], expected, atol=1e-3)
 
 
 def test_keyframes_links_and_loops(recorded):
     quads = rrd_columns(recorded, "/mosaic/keyframes", STRIPS)[1][0]
-    expected = transform_points(square_from_world(), keyframes()[1])
+    expected = transform_points(framed_from_world(), keyframes()[1])
     np.testing.assert_allclose(quads[1][:4], expected, atol=1e-3)
     centres = [np.mean(quad[:4], axis=0) for quad in quads]
     (link,) = rrd_columns(recorded, "/mosaic/links", STRIPS)[1][0]
@@ -168,10 +168,10 @@ def test_paths_follow_the_targets_and_the_adjusted_keyframes(recorded):
     centres = [
         transform_points(pose(index), crossing(tracked("board", index).quad))[0] for index in seen
     ]
-    expected = transform_points(square_from_world(), centres)
+    expected = transform_points(framed_from_world(), centres)
     np.testing.assert_allclose(paths[25][0], expected, atol=0.01)
     moved = np.array(paths[50][0])[: len(expected)]
-    np.testing.assert_allclose(moved, expected + 20.0 * 1.92, atol=0.02)  # 40 px at half size
+    np.testing.assert_allclose(moved, expected + 20.0 * 2.56, atol=0.02)  # 40 px at half size
     frames, places = rrd_columns(recorded, "/mosaic/targets/board/position", "Points2D:positions")
     places = dict(zip(frames, places, strict=True))
     np.testing.assert_allclose(places[20][0], expected[seen.index(20)], atol=0.01)
@@ -217,9 +217,9 @@ def test_a_fixed_camera_has_its_paths_on_the_background(tmp_path):
     assert 2 <= len(pictures) < 8
     shown = cv2.imdecode(np.asarray(pictures[-1][0], np.uint8), cv2.IMREAD_COLOR)
     assert shown[shown.shape[0] // 2].max() < 110
-    square_from_world = translation((768 - 4 * 160) / 2, (768 - 4 * 120) / 2) @ scaling(4.0)
+    framed_from_world = translation((1024 - 4 * 160) / 2, (576 - 4 * 120) / 2) @ scaling(4.0)
     (line,) = rrd_columns(path, "/mosaic/targets/board/path", STRIPS)[1][-1]
-    expected = transform_points(square_from_world, crossing(tracked("board", 0).quad))
+    expected = transform_points(framed_from_world, crossing(tracked("board", 0).quad))
     np.testing.assert_allclose(line[0], expected[0], atol=1)
 
 
@@ -251,7 +251,7 @@ def test_a_large_mosaic_is_recorded_small(tmp_path):
             recorder.log_mosaic(mosaic_view(width=3000), 25 * second, float(second))
             assert not recorder.is_mosaic_due(second + 0.5)
     pictures = [blob(one) for one in rrd_columns(path, "/mosaic/image", BLOB)[1]]
-    assert cv2.imdecode(np.frombuffer(pictures[0], np.uint8), 1).shape == (768, 768, 3)
+    assert cv2.imdecode(np.frombuffer(pictures[0], np.uint8), 1).shape == (576, 1024, 3)
     assert all(len(data) < 600_000 for data in pictures)
 
 
@@ -260,7 +260,7 @@ def test_a_growing_picture_keeps_its_size_and_what_is_drawn_its_place(tmp_path):
     path = tmp_path / "growing.rrd"
     with Recorder(path, source(), Settings(), [], has_mosaic=True) as recorder:
         for second, (width, height) in enumerate([(90, 40), (300, 500), (3000, 400)]):
-            preview = np.zeros((height, width, 3), np.uint8)
+            preview = np.full((height, width, 3), 30, np.uint8)
             x0, y0, x1, y1 = width // 4, height // 4, width // 2, height // 2
             preview[y0:y1, x0:x1] = 255
             outline = box_quad(x0 - 0.5, y0 - 0.5, x1 - x0, y1 - y0)
@@ -271,10 +271,42 @@ def test_a_growing_picture_keeps_its_size_and_what_is_drawn_its_place(tmp_path):
     outlines = rrd_columns(path, "/mosaic/frame", STRIPS)[1]
     for data, outline in zip(pictures, outlines, strict=True):
         shown = cv2.imdecode(np.frombuffer(data, np.uint8), 0)
-        assert shown.shape == (768, 768)
+        assert shown.shape == (576, 1024)
         x, y, width, height = cv2.boundingRect((shown > 127).astype(np.uint8))
         expected = box_quad(x - 0.5, y - 0.5, width, height)
         np.testing.assert_allclose(outline[0][:4], expected, atol=1.0)
+
+
+def test_what_is_not_covered_takes_no_room(tmp_path):
+    """The canvas is of whole tiles; what there is of a mosaic fills the picture all the same."""
+    path = tmp_path / "part.rrd"
+    preview = np.zeros((800, 900, 3), np.uint8)
+    preview[500:600, 300:700] = 200
+    outline = box_quad(299.5, 499.5, 400, 100)
+    with Recorder(path, source(), Settings(), [], has_mosaic=True) as recorder:
+        recorder.log(step_of(0, ()))
+        recorder.log_mosaic(MosaicView(preview, np.eye(3), outline, outline[None], (), ()), 0, 0.0)
+    (data,) = rrd_columns(path, "/mosaic/image", BLOB)[1]
+    shown = cv2.imdecode(np.frombuffer(blob(data), np.uint8), 0)
+    x, y, width, height = cv2.boundingRect((shown > 100).astype(np.uint8))
+    assert (width, height) == pytest.approx((1024, 256), abs=2)
+    (drawn,) = rrd_columns(path, "/mosaic/frame", STRIPS)[1]
+    np.testing.assert_allclose(drawn[0][:4], box_quad(x - 0.5, y - 0.5, width, height), atol=1.0)
+
+
+def test_a_moving_camera_has_its_paths_over_the_first_frame(tmp_path):
+    path, world = tmp_path / "moving.rrd", WorldMotion()
+    settings = build_settings({"camera": "moving"})
+    with Recorder(path, source(), settings, ["board"]) as recorder:
+        for index in range(40):
+            step = step_of(index, lost=())
+            frame = replace(step.frame, image=np.full_like(step.frame.image, 90 + index))
+            camera = CameraPose(translation(3.0 * index, 0))
+            recorder.log(world.placed(replace(step, frame=frame, camera=camera)))
+    (data,) = rrd_columns(path, "/mosaic/image", BLOB)[1]
+    assert np.median(cv2.imdecode(np.asarray(data[0], np.uint8), 0)[200:400, 300:700]) == 90
+    outline = rrd_columns(path, "/mosaic/frame", STRIPS)[1][-1]
+    np.testing.assert_allclose(outline[0][0][0] - (1024 - 640) / 2, 4 * (3 * 39 + 0.5), atol=2.1)
 
 
 def features(count):

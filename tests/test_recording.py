@@ -19,6 +19,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 from rrd import rrd_columns, rrd_entities, rrd_timelines
 
@@ -27,6 +28,7 @@ import streamtrack.recording.video as recorded_video
 import streamtrack.viewer as viewer
 from streamtrack.errors import OutputError, SourceError
 from streamtrack.geometry import box_quad, transform_points, translation
+from streamtrack.recording import blueprint
 from streamtrack.recording.entities import TargetEntities
 from streamtrack.recording.recorder import Recorder, view
 from streamtrack.settings import Settings, build_settings
@@ -680,3 +682,29 @@ def test_view_listens_on_loopback_only(recorded, monkeypatch, capsys):
         assert command[command.index("--bind") + 1] == "127.0.0.1"
     assert opened[0].startswith("http://127.0.0.1:9123/?url=")
     assert opened[0] in capsys.readouterr().out
+
+
+def view_names(part):
+    """The names of all views below a part of a layout."""
+    if not isinstance(part, rrb.Container):
+        return [part.name]
+    return [name for one in part.contents for name in view_names(one)]
+
+
+@pytest.mark.parametrize(
+    ("names", "finds_targets", "has_tracks", "curves"),
+    [
+        (["a"], False, True, "Features, matches, inliers"),
+        (["a"], True, True, "Features, matches, inliers"),
+        ([], True, True, "Targets found"),
+        ([], False, False, None),
+    ],
+)
+def test_the_layout_has_no_panel_that_stays_empty(names, finds_targets, has_tracks, curves):
+    for world in blueprint.World:
+        layout = blueprint.build((64, 48), names, "frame", world, finds_targets=finds_targets)
+        shown = view_names(layout.root_container)
+        assert ("Tracks" in shown) == has_tracks
+        counted = {"Features, matches, inliers", "Targets found"} & set(shown)
+        assert curves in counted if curves else not counted
+        assert ("World" in shown) == (world is not blueprint.World.NONE)

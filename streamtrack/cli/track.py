@@ -42,12 +42,13 @@ def track(
         ),
     ],
     target: Annotated[
-        list[str],
+        list[str] | None,
         typer.Option(
             help="[NAME=]x,y,w,h or [NAME=]x1,y1,...,x4,y4 in pixels of the first frame, or "
-            "[NAME=]PICTURE[@region of it] to search for, or auto: all that moves. May repeat.",
+            "[NAME=]PICTURE[@region of it] to search for, or auto: all that moves. May repeat; "
+            "not needed with --mosaic, --poses or --stabilize.",
         ),
-    ],
+    ] = None,
     method: Annotated[
         str | None,
         typer.Option(help="hybrid (predict, warp back, flow) or detect (every frame by itself)."),
@@ -185,7 +186,12 @@ def track(
         },
     )
     make_ground(chosen.world)  # what is wrong with the known points is said at once
-    targets = parse_targets(target)
+    if not (target or mosaic or poses or stabilize):
+        raise UsageError(
+            "nothing to follow: give --target x,y,w,h or --target auto; for the camera alone "
+            "--mosaic, --poses or --stabilize"
+        )
+    targets = parse_targets(target or [])
     finds_targets = auto_target(targets) is not None  # against the background, wherever that goes
     is_world_wanted = bool(mosaic or poses or stabilize or chosen.world != WorldSettings())
     if (finds_targets or is_world_wanted) and "camera" not in chosen.model_fields_set:

@@ -23,29 +23,20 @@ from streamtrack.recording.entities import (
     TRACKS,
     TargetEntities,
 )
-from streamtrack.settings import Settings
 from streamtrack.types import Size
 
 _MAX_SIDE_BY_SIDE = 3
 
 
 class World(StrEnum):
-    """What a recording shows of the world: nothing, or paths, alone or over a picture of it.
+    """What a recording shows of the world: nothing, or paths over a picture of it.
 
-    The picture is the background of a camera that stands, or a growing mosaic.
+    The picture is the background where the first frame was taken, or a growing mosaic.
     """
 
     NONE = "none"
-    PATHS = "paths"
     BACKGROUND = "background"
     MOSAIC = "mosaic"
-
-
-def world_shown(settings: Settings, has_mosaic: bool) -> World:
-    """What the recording of a run shows."""
-    if has_mosaic:
-        return World.MOSAIC
-    return World.BACKGROUND if settings.camera == "fixed" else World.PATHS
 
 
 def build(
@@ -55,20 +46,23 @@ def build(
     world: World = World.NONE,
     is_live: bool = False,
     is_following: bool = False,
+    finds_targets: bool = False,
 ) -> rrb.Blueprint:
     """The layout for a screen of about 1920x1080: what the camera sees, and the world.
 
     They are two tabs where there is a world to show; the one with the targets that were named is
-    in front. ``is_following`` keeps to the newest data, as a live view should.
+    in front. ``is_following`` keeps to the newest data, as a live view should;
+    ``finds_targets`` where targets that nobody named may come.
     """
     targets = [(name, TargetEntities.of(name)) for name in target_names]
     states = [entities.state for _, entities in targets]
     states += [MOSAIC_STATE] if world is World.MOSAIC else []
     states += [SOURCE_STATE] if is_live else []
+    tracks = [_tracks_view()] if targets or finds_targets else []
     lanes_share = [0.75 + 0.42 * min(len(states), 6)] if states else []
     camera = rrb.Vertical(
-        _camera_row(size_wh, targets, timeline),
-        _curves(targets, [], is_live),
+        _camera_row(size_wh, targets, tracks, timeline),
+        _curves(targets, [], is_live, finds_targets),
         *_lanes(states),
         row_shares=[6.0, 2.6, *lanes_share],
         name="Camera",
@@ -76,12 +70,15 @@ def build(
     if world is World.NONE:
         return whole_layout(camera, timeline, is_following)
     around = rrb.Vertical(
-        _camera_view(size_wh), _tracks_view(), text_tabs(timeline), row_shares=[3.0, 2.4, 2.2]
+        _camera_view(size_wh),
+        *tracks,
+        text_tabs(timeline),
+        row_shares=[3.0, *[2.4 for _ in tracks], 2.2],
     )
     curves = [_curve("Mosaic", [f"{MOSAIC_CURVES}/**"])] if world is World.MOSAIC else []
     world_tab = rrb.Vertical(
         rrb.Horizontal(_mosaic_view(), around, column_shares=[6.6, 3.4]),
-        *([_curves([], curves, is_live)] if curves else []),
+        *([_curves([], curves, is_live, finds_targets)] if curves else []),
         *_lanes(states),
         row_shares=[7.0, *([1.8] if curves else []), *lanes_share],
         name="World",
@@ -91,14 +88,22 @@ def build(
 
 
 def _camera_row(
-    size_wh: Size, targets: Sequence[tuple[str, TargetEntities]], timeline: str
+    size_wh: Size,
+    targets: Sequence[tuple[str, TargetEntities]],
+    tracks: Sequence[rrb.TextDocumentView],
+    timeline: str,
 ) -> rrb.Horizontal:
-    """The picture, and beside it close-ups of the targets and the texts."""
+    """The picture, and beside it close-ups of the targets, how they fare, and the texts."""
     rows_of_targets = len(targets) if len(targets) <= _MAX_SIDE_BY_SIDE else 1
     side = rrb.Vertical(
         *_close_ups(targets),
-        text_tabs(timeline, _tracks_view()),
-        row_shares=[1.0 + rows_of_targets, 3.0] if targets else [1.0],
+        *tracks,
+        text_tabs(timeline),
+        row_shares=[
+            *([1.0 + rows_of_targets] if targets else []),
+            *[0.6 + 0.4 * min(max(len(targets), 1), 4) for _ in tracks],
+            2.4,
+        ],
     )
     return rrb.Horizontal(_camera_view(size_wh), side, column_shares=[5.0, 3.0])
 
@@ -131,8 +136,8 @@ def whole_layout(root: Any, timeline: str, is_following: bool = False) -> rrb.Bl
     )
 
 
-def text_tabs(timeline: str, *more: Any) -> rrb.Tabs:
-    """The summary, in front, the log, and more."""
+def text_tabs(timeline: str) -> rrb.Tabs:
+    """The summary, in front, and the log."""
     return rrb.Tabs(
         rrb.TextLogView(
             name="Log",
@@ -142,7 +147,6 @@ def text_tabs(timeline: str, *more: Any) -> rrb.Tabs:
             ),
         ),
         rrb.TextDocumentView(name="Summary", origin=f"/{SUMMARY}"),
-        *more,
         active_tab=1,
     )
 
@@ -182,20 +186,26 @@ def _close_ups(targets: Sequence[tuple[str, TargetEntities]]) -> list[Any]:
 
 
 def _curves(
-    targets: Sequence[tuple[str, TargetEntities]], first: Sequence[Any], is_live: bool
+    targets: Sequence[tuple[str, TargetEntities]],
+    first: Sequence[Any],
+    is_live: bool,
+    finds_targets: bool,
 ) -> rrb.Horizontal | rrb.Tabs:
     more: list[Any] = list(first)
     if is_live:
         age = _curve("Age of the frame in ms", [AGE_MS])
         more.append(rrb.Tabs(age, _curve("Frames not seen", [f"{SOURCE_COUNTS}/**"]), active_tab=0))
     if len(targets) <= _MAX_SIDE_BY_SIDE:
-        return _curve_row([entities for _, entities in targets], more)
-    rows = [_curve_row([entities], more, name) for name, entities in targets]
+        return _curve_row([entities for _, entities in targets], more, finds_targets)
+    rows = [_curve_row([entities], more, finds_targets, name) for name, entities in targets]
     return rrb.Tabs(*rows, active_tab=0)
 
 
 def _curve_row(
-    targets: Sequence[TargetEntities], more: Sequence[Any], name: str | None = None
+    targets: Sequence[TargetEntities],
+    more: Sequence[Any],
+    finds_targets: bool,
+    name: str | None = None,
 ) -> rrb.Horizontal:
     counts = [path for target in targets for path in (target.matches, target.inliers)]
     agreement = rrb.Tabs(
@@ -203,8 +213,12 @@ def _curve_row(
         _curve("Correlation", [target.correlation for target in targets]),
         active_tab=0,
     )
+    counted = _curve(
+        "Features, matches, inliers" if targets else "Targets found",
+        [FEATURE_COUNT, f"{FOUND_CURVES}/**", *counts],
+    )
     return rrb.Horizontal(
-        _curve("Features, matches, inliers", [FEATURE_COUNT, f"{FOUND_CURVES}/**", *counts]),
+        *([counted] if targets or finds_targets else []),
         *([agreement] if targets else []),
         _curve("Milliseconds a frame", [f"{TOTAL_MS}/**"]),
         *more,

@@ -67,6 +67,7 @@ class LiveView(Closing):
         target_names: Sequence[str],
         template_views: Mapping[str, Image] | None = None,
         has_mosaic: bool = False,
+        finds_targets: bool = False,
     ) -> None:
         self.address = address
         self.dropped = 0
@@ -75,9 +76,16 @@ class LiveView(Closing):
             name: reduced(picture, self._factor) for name, picture in (template_views or {}).items()
         }
         size_wh = round(source.size_wh[0] * self._factor), round(source.size_wh[1] * self._factor)
-        world = blueprint.world_shown(settings, has_mosaic)
+        world = blueprint.World.MOSAIC if has_mosaic else blueprint.World.BACKGROUND
         self._layout = Layout(
-            blueprint.build(size_wh, target_names, timeline_of(source), world, source.is_live)
+            blueprint.build(
+                size_wh,
+                target_names,
+                timeline_of(source),
+                world,
+                source.is_live,
+                finds_targets=finds_targets,
+            )
         )
         self._stream = new_stream()
         self._clock = Clock(self._stream, source.is_live)

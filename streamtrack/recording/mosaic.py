@@ -14,7 +14,15 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from streamtrack.geometry import box_quad, inverted, scaling, transform_points, translation
+from streamtrack.geometry import (
+    box_quad,
+    image_quad,
+    inverted,
+    largest_shift,
+    scaling,
+    transform_points,
+    translation,
+)
 from streamtrack.mosaic.types import MosaicView, PlacedFrame
 from streamtrack.recording import rows, styles
 from streamtrack.recording.background import BackgroundPicture
@@ -33,11 +41,13 @@ from streamtrack.targets import color_number
 from streamtrack.types import Frame, Image, Matrix, Points, Size, Step, WorldPlace
 
 _IMAGE_EVERY_S = 1.0
-_SIDE, _MOST_ENLARGED = 768, 4.0
+_SHOWN_WH, _MOST_ENLARGED = (1024, 576), 4.0  # as wide as the view on a common screen
 _MAX_BYTES = 256_000
 _QUALITIES = (80, 65, 50)
 _MAX_PATH = 1000
 _MOST_TARGETS = 64
+_MOST_OFF_PX = 1.0
+"""Corners of a frame that are off by less: the camera looks where it did in the first frame."""
 
 _STATE_COLORS: dict[str, styles.Rgb] = {
     "placed": styles.LANE_GREEN,
@@ -78,34 +88,38 @@ class MosaicLog:
         self._places = {track.name: track.world for track in step.tracks if track.world is not None}
         self._numbers = {t.name: color_number(t, place) for place, t in enumerate(step.tracks)}
 
-    def log_background(self, frame: Frame) -> None:
-        """Record what lies behind the targets of a camera that stands, where that is known anew."""
-        picture = self._background.seen(frame)
-        if picture is None:
-            return
-        if self._preview_from_world is None:
-            self._log_styles()
-        square, square_from_picture = _framed(picture)
-        width, height = frame.size_wh
-        small = scaling(picture.shape[1] / width, picture.shape[0] / height)
-        self._preview_from_world = square_from_picture @ small
-        self._stream.log(MOSAIC_IMAGE, rr.EncodedImage.from_fields(blob=self._jpeg(square)))
-
     def log_world(self, step: Step) -> None:
-        """Record the camera's view and the targets' paths where no mosaic is made, in world px."""
+        """Record the camera's view and the targets' paths where no mosaic is made.
+
+        They lie over what a camera that stands shows behind the targets, or over the first frame.
+        """
         if self._preview_from_world is None:
             self._preview_from_world = np.eye(3)
             self._log_styles()
         self.follow(step)
-        pose = step.camera.world_from_frame
+        pose, size_wh = step.camera.world_from_frame, step.frame.size_wh
         if pose is not None:
-            self._log_outline(_outline(pose, step.frame.size_wh))
+            is_at_start = largest_shift(pose, image_quad(size_wh)) < _MOST_OFF_PX
+            if is_at_start and not step.camera.warning:
+                self._log_background(step.frame)
+            self._log_outline(_outline(pose, size_wh))
         else:
             self._log_strips(MOSAIC_FRAME, np.zeros((0, 5, 2), np.float32))
         self._log_targets()
         if self.is_image_due(step.frame.time_s):
             self._last_image_s = step.frame.time_s
             self.log_paths()
+
+    def _log_background(self, frame: Frame) -> None:
+        """Record what lies behind the targets, where that is known anew."""
+        picture = self._background.seen(frame)
+        if picture is None:
+            return
+        framed, framed_from_picture = _framed(picture)
+        width, height = frame.size_wh
+        small = scaling(picture.shape[1] / width, picture.shape[0] / height)
+        self._preview_from_world = framed_from_picture @ small
+        self._stream.log(MOSAIC_IMAGE, rr.EncodedImage.from_fields(blob=self._jpeg(framed)))
 
     def is_image_due(self, time_s: float) -> bool:
         """Whether a view of the mosaic would be recorded now, on the source's clock."""
@@ -125,9 +139,9 @@ class MosaicLog:
             return
         if self._preview_from_world is None and not self._state:
             self._log_styles()
-        picture, square_from_preview = _framed(view.preview)
+        picture, framed_from_preview = _framed(view.preview)
         data = self._jpeg(picture)
-        preview_from_world = square_from_preview @ inverted(view.world_from_preview)
+        preview_from_world = framed_from_preview @ inverted(view.world_from_preview)
         self._preview_from_world = preview_from_world
         self._outlines = np.asarray(view.keyframe_outlines, np.float32).reshape(-1, 4, 2)
         self._stream.log(MOSAIC_IMAGE, rr.EncodedImage.from_fields(blob=data))
@@ -275,19 +289,29 @@ def _edge_lines(
 
 
 def _framed(picture: Image) -> tuple[Image, Matrix]:
-    """The picture in the middle of a black square, as large as fits, and what maps its pixels.
+    """What there is of the picture, as large as fits, amid black; and what maps its pixels.
 
-    The square is always the same: the viewer takes JPEGs for a video and complains of a change.
+    The size is always the same: the viewer takes JPEGs for a video and complains of a change.
     """
-    factor = min(_MOST_ENLARGED, _SIDE / max(picture.shape[:2]))
-    width, height = (max(1, round(side * factor)) for side in picture.shape[1::-1])
+    left, top, width, height = _covered(picture)
+    factor = min(_MOST_ENLARGED, _SHOWN_WH[0] / width, _SHOWN_WH[1] / height)
+    size_wh = max(1, round(width * factor)), max(1, round(height * factor))
     method = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
-    square = np.zeros((_SIDE, _SIDE, *picture.shape[2:]), np.uint8)
-    x, y = (_SIDE - width) // 2, (_SIDE - height) // 2
-    square[y : y + height, x : x + width] = cv2.resize(
-        picture, (width, height), interpolation=method
+    framed = np.zeros((*_SHOWN_WH[::-1], *picture.shape[2:]), np.uint8)
+    x, y = ((most - side) // 2 for most, side in zip(_SHOWN_WH, size_wh, strict=True))
+    framed[y : y + size_wh[1], x : x + size_wh[0]] = cv2.resize(
+        picture[top : top + height, left : left + width], size_wh, interpolation=method
     )
-    return square, translation(x, y) @ scaling(factor)
+    return framed, translation(x, y) @ scaling(factor) @ translation(-left, -top)
+
+
+def _covered(picture: Image) -> tuple[int, int, int, int]:
+    """The box x, y, width, height of what is not black; all of a picture that is black."""
+    is_covered = picture if picture.ndim == 2 else picture.max(axis=2)
+    left, top, width, height = cv2.boundingRect(is_covered)
+    if not (width and height):
+        return 0, 0, picture.shape[1], picture.shape[0]
+    return left, top, width, height
 
 
 def _log_styles(stream: rr.RecordingStream) -> None:

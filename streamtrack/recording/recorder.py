@@ -68,6 +68,7 @@ class Recorder(Closing):
         target_names: Sequence[str],
         template_views: Mapping[str, Image] | None = None,
         has_mosaic: bool = False,
+        finds_targets: bool = False,
     ) -> None:
         self.failed: str | None = None
         self._source = source
@@ -81,9 +82,14 @@ class Recorder(Closing):
         self._series = None if self._rotate is None else FileSeries(path)
         self.path = path if self._series is None else self._series.next_path()
 
-        world = blueprint.world_shown(settings, has_mosaic)
+        world = blueprint.World.MOSAIC if has_mosaic else blueprint.World.BACKGROUND
         layout = blueprint.build(
-            source.size_wh, target_names, timeline_of(source), world, source.is_live
+            source.size_wh,
+            target_names,
+            timeline_of(source),
+            world,
+            source.is_live,
+            finds_targets=finds_targets,
         )
         self._stream = new_stream()
         self._files = RecordingFiles(self._stream, layout)

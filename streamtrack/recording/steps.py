@@ -145,8 +145,6 @@ class StepLog:
         self._log_times(step)
         self._table.follow(step)
         if self._world is blueprint.World.BACKGROUND:
-            self._mosaic.log_background(step.frame)
-        if self._world in (blueprint.World.PATHS, blueprint.World.BACKGROUND):
             self._mosaic.log_world(step)
         else:
             self._mosaic.follow(step)

@@ -15,7 +15,7 @@ from typing import Generic, Protocol, TypeVar
 
 from streamtrack.camera.auto import make_camera
 from streamtrack.camera.moving import CameraEstimator
-from streamtrack.errors import OutputError, SourceError, StreamtrackError, UsageError
+from streamtrack.errors import SourceError, StreamtrackError, UsageError
 from streamtrack.mosaic.picture_files import check_picture_path
 from streamtrack.pipeline import track
 from streamtrack.results import check_tracks_path
@@ -192,9 +192,6 @@ def _check_outputs(job: TrackJob) -> None:
         raise UsageError(f"recording {outputs.record}: give it the ending .rrd")
     if outputs.mosaic is not None:
         check_picture_path(outputs.mosaic)
-    for at_the_end in (outputs.mosaic, outputs.summary):
-        if at_the_end is not None and at_the_end.is_dir():
-            raise OutputError(f"cannot write {at_the_end}: this is a folder; name a file in it")
     sources = [job.source] if isinstance(job.source, str) else job.source
     taken = {Path(source).resolve(): f"the source {source}" for source in sources}
     for name in ("record", "tracks", "poses", "video", "summary", "mosaic", "stabilized"):

@@ -57,7 +57,7 @@ def write_file(path: Path, data: bytes) -> None:
         if real.exists() and not real.is_file():
             real.write_bytes(data)
             return
-        part = real.with_name(f".{real.name[:100]}.{os.getpid()}.part")
+        part = _neighbour(real)
         try:
             part.write_bytes(data)
             part.replace(real)
@@ -65,6 +65,25 @@ def write_file(path: Path, data: bytes) -> None:
             part.unlink(missing_ok=True)
     except OSError as error:
         raise output_error(path, error) from None
+
+
+def check_writable(path: Path) -> None:
+    """Raise OutputError now if `write_file` could not write there later. Makes missing folders."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        real = path.resolve()
+        if real.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if not real.exists() or real.is_file():
+            part = _neighbour(real)
+            part.touch()
+            part.unlink()
+    except OSError as error:
+        raise output_error(path, error) from None
+
+
+def _neighbour(path: Path) -> Path:
+    return path.with_name(f".{path.name[:100]}.{os.getpid()}.part")
 
 
 def encodable(text: str) -> str:

@@ -20,6 +20,7 @@ from streamtrack.camera.moving import CameraEstimator
 from streamtrack.camera.notes import CameraNotes
 from streamtrack.errors import OutputError, StreamtrackError
 from streamtrack.mosaic.types import PlacedFrame
+from streamtrack.outputs import check_writable
 from streamtrack.poses import FinalPoses, PosesWriter
 from streamtrack.results import GROUND_COLUMNS, TRACK_COLUMNS, open_tracks_writer
 from streamtrack.settings import Settings, WorldSettings
@@ -151,6 +152,9 @@ def open_watchers(
     Raises OutputError.
     """
     info = source.info
+    for at_the_end in (outputs.mosaic, outputs.summary):
+        if at_the_end is not None:
+            check_writable(at_the_end)
     if outputs.summary is not None:
         result.finishers.append(_summary_finisher(outputs.summary))
     if outputs.tracks is not None:

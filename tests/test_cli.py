@@ -182,6 +182,32 @@ def test_the_world_is_asked_for_and_told(run: Run, clip: Path, target: str, tmp_
     assert held_still.get(cv2.CAP_PROP_FRAME_COUNT) == len(rows)
 
 
+def test_the_camera_alone_needs_no_target(run: Run, clip: Path, tmp_path: Path) -> None:
+    flags = ("-q", "--mosaic", "m.png", "--stabilize", "s.mp4", "--output", "t.csv")
+    assert run("track", clip, *flags, "--poses", "p.csv", "--record", "r.rrd") == 0
+    assert len(rows_of(tmp_path / "p.csv")) == 24 and rows_of(tmp_path / "t.csv") == []
+    assert (tmp_path / "m.png").stat().st_size and (tmp_path / "r.rrd").stat().st_size
+
+
+@pytest.mark.parametrize("flag", ["--mosaic", "--summary"])
+@pytest.mark.parametrize(("place", "why"), [("", "folder"), ("file/", "a file stands")])
+def test_what_cannot_be_written_in_the_end_is_said_at_once(
+    run: Run,
+    clip: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    flag: str,
+    place: str,
+    why: str,
+) -> None:
+    (tmp_path / "m.png").mkdir()
+    (tmp_path / "file").touch()
+    outputs = ("--poses", "p.csv", flag, f"{place}m.png")
+    assert run("track", clip, "--no-record", *outputs) == 1
+    assert why in capsys.readouterr().err
+    assert not (tmp_path / "p.csv").exists()
+
+
 @pytest.mark.parametrize(("flags", "camera"), [((), "fixed"), (("--poses", "p.csv"), "auto")])
 def test_the_camera_is_taken_for_fixed_unless_the_world_is_wanted(
     run: Run, clip: Path, target: str, tmp_path: Path, flags: tuple[str, ...], camera: str

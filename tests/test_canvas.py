@@ -19,7 +19,7 @@ from streamtrack.mosaic.picture_files import open_picture
 from streamtrack.mosaic.spill import SpillFile
 from streamtrack.mosaic.stream import bands, painting
 from streamtrack.mosaic.stream.canvas import Canvas
-from streamtrack.mosaic.stream.consensus import Chooser
+from streamtrack.mosaic.stream.consensus import Chooser, Sample, choose
 from streamtrack.mosaic.stream.coverage import CellGrid, Footprint, footprint
 from streamtrack.mosaic.stream.tiles import TILE_BYTES, tile_box, tile_keys
 from streamtrack.types import Image, Matrix
@@ -196,7 +196,10 @@ def test_the_weight_falls_from_the_centre(size_wh: tuple[int, int]) -> None:
 def painted(canvas: Canvas, frame: Image, canvas_from_frame: Matrix) -> painting.Comparison:
     """The frame painted into the canvas as the stream does it."""
     box = painting.box_of(canvas_from_frame, (frame.shape[1], frame.shape[0]))
-    small = painting.shrunk(frame, (), canvas_from_frame, 1.0, box)
+    small_from_frame = geometry.scaling(1 / painting.SHRINK) @ canvas_from_frame
+    small_from_pixels = small_from_frame @ geometry.scaling(painting.SHRINK)
+    pixels = painting.shrunk(painting.weighted(frame))
+    small = painting.warped(pixels, small_from_pixels, painting.quarter(box))
     seen = painting.compared(box, painting.quartered(canvas.read(box)), small)
     for part in seen.parts():
         new = painting.warped(painting.weighted(frame), canvas_from_frame, part)
@@ -326,6 +329,23 @@ def test_of_two_that_disagree_the_one_without_an_outline_is_the_ground(
     assert choice is not None and choice.tally.undecided > 80 * 90
 
 
+@pytest.mark.parametrize("is_thing_older", [False, True])
+def test_a_thing_that_has_the_votes_in_one_half_and_not_in_the_other_is_not_cut(
+    make_picture: MakePicture, is_thing_older: bool
+) -> None:
+    """Two frames end in the middle of it: one shows the thing, the other the ground."""
+    background = np.asarray(cv2.GaussianBlur(make_picture(6, (256, 256)), (0, 0), 4), np.uint8)
+    with_thing = background.copy()
+    with_thing[80:160, 80:176] = 245
+    samples = [bgrw(image) for image in (with_thing, with_thing, background, background)]
+    samples[1][:, 128:] = 0
+    samples[3][:, :128] = 0
+    if not is_thing_older:
+        samples.reverse()
+    picture, _ = chosen(samples)
+    np.testing.assert_array_equal(picture[..., 0], background)
+
+
 def noisy_road(rng: np.random.Generator) -> Image:
     road = 60 + rng.normal(0, 2, (256, 256))
     road[120:124] += 60
@@ -378,11 +398,9 @@ def test_what_is_shut_out_has_a_smooth_outline(make_picture: MakePicture) -> Non
 
 def test_samples_that_agree_are_left_as_they_are(make_picture: MakePicture) -> None:
     picture = make_picture(8, (128, 128))
-    samples = [bgrw(picture, 40), bgrw(picture, 80)]
-    chooser = Chooser((128, 128))
-    for number, sample in enumerate(samples):
-        chooser.add(sample, is_primary=number == 0)
-    choice = chooser.choice()
+    pixels = [bgrw(picture, 40), bgrw(picture, 80)]
+    samples = [Sample(p, painting.quartered(p), n == 0, n) for n, p in enumerate(pixels)]
+    choice = choose(samples, {})
     assert choice is not None
     assert (choice.labels == 0).all()  # the other one stands back, though it is heavier
     assert choice.tally.contested == 0

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack.mosaic.stream.painting import FEATHER, disagreement, quartered
+from streamtrack.mosaic.stream.settling import Differs
 from streamtrack.mosaic.stream.voting import MANY, vote
 from streamtrack.types import Image, Mask, Size
 
@@ -102,6 +103,50 @@ class Choice:
         return most
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """One view of a block, taken at a moment.
+
+    ``pixels`` BGRW (H, W, 4), None if it shows nothing there; ``small`` (h, w, 4) the same at a
+    quarter of the size, and as much around it as votes are taken of. One that is not primary votes
+    as the others do, but its pixels stand back behind theirs.
+    """
+
+    pixels: Image | None
+    small: Image
+    is_primary: bool
+    moment: int
+
+
+def choose(samples: Sequence[Sample], differs: Differs, around: int = 0) -> Choice | None:
+    """What samples of a block, oldest first, are worth; None if none shows anything.
+
+    ``differs`` has where pairs of them disagree, ``around`` cells beyond the block as well.
+    """
+    showing = [n for n, sample in enumerate(samples) if sample.pixels is not None]
+    if not showing:
+        return None
+    shown = [(samples[n].pixels, samples[n].is_primary) for n in showing]
+    pixels = tuple(one for one, _ in shown if one is not None)
+    weights = [_weight(one, is_primary) for one, is_primary in shown if one is not None]
+    small = np.stack([sample.small for sample in samples])
+    rows, columns = (slice(around, side - around) for side in small.shape[1:3])
+    times = np.count_nonzero(small[:, rows, columns, 3], axis=0)
+    overlap = int(np.count_nonzero(times > 1)) * 16
+    if not differs and len(samples) < MANY:
+        return Choice(pixels, tuple(weights), Tally(overlap))
+    votes = vote(small, differs, [sample.moment for sample in samples], around)
+    outliers = [votes.outliers[n] for n in showing]
+    judged = [
+        _shut_out(weight, outlier) if outlier.any() else weight
+        for weight, outlier in zip(weights, outliers, strict=True)
+    ]
+    contested, undecided = (
+        int(np.count_nonzero(cells)) * 16 for cells in (votes.contested, votes.undecided)
+    )
+    return Choice(pixels, _without_holes(weights, judged), Tally(overlap, contested, undecided))
+
+
 class Chooser:
     """Compares samples of one block as they come, so that the work can be spread over time.
 
@@ -109,21 +154,15 @@ class Chooser:
     """
 
     def __init__(self, size_wh: Size) -> None:
-        self._size_wh = size_wh
-        self._samples: list[Image] = []
-        self._is_primary: list[bool] = []
-        self._moments: list[int] = []
+        self._samples: list[Sample] = []
         self._small = np.zeros((0, size_wh[1] // 4 + _GAP, size_wh[0] // 4, 4), np.uint8)
         self._differs: dict[tuple[int, int], Mask] = {}
 
     def __len__(self) -> int:
         return len(self._samples)
 
-    def add(self, pixels: Image, is_primary: bool = True, moment: int | None = None) -> None:
-        """Compare a sample, taken at a moment, with all before; one without weight is left out.
-
-        One that is not primary votes as the others do, but its pixels stand back behind theirs.
-        """
+    def add(self, pixels: Image, moment: int | None = None) -> None:
+        """Compare a sample, taken at a moment, with all before; one without weight is left out."""
         if not cv2.countNonZero(cv2.extractChannel(pixels, 3)):
             return
         count, (_, height, width, _) = len(self), self._small.shape
@@ -135,9 +174,8 @@ class Chooser:
         if count:
             self._compare(small, count)
         self._small[count] = small
-        self._samples.append(pixels)
-        self._is_primary.append(is_primary)
-        self._moments.append(count if moment is None else moment)
+        now = count if moment is None else moment
+        self._samples.append(Sample(pixels, small[:-_GAP], True, now))
 
     def _compare(self, small: Image, count: int) -> None:
         """The samples before are one tall picture, a gap below each: a few calls for all."""
@@ -149,31 +187,15 @@ class Chooser:
 
     def choice(self) -> Choice | None:
         """What the samples so far are worth; None if there is none."""
-        if not self._samples:
-            return None
-        weights = [
-            _weight(pixels, is_primary)
-            for pixels, is_primary in zip(self._samples, self._is_primary, strict=True)
-        ]
-        covered = self._small[: len(self), :-_GAP, :, 3] > 0
-        times = covered.sum(axis=0, dtype=np.int16)
-        overlap = int(np.count_nonzero(times > 1)) * 16
-        if not self._differs and len(self) < MANY:
-            return Choice(tuple(self._samples), tuple(weights), Tally(overlap))
-        votes = vote(self._small[: len(self), :-_GAP], self._differs, self._moments)
-        judged = [
-            self._shut_out(weight, outlier) if outlier.any() else weight
-            for weight, outlier in zip(weights, votes.outliers, strict=True)
-        ]
-        tally = Tally(overlap, votes.contested * 16, votes.undecided * 16)
-        return Choice(tuple(self._samples), _without_holes(weights, judged), tally)
+        return choose(self._samples, self._differs)
 
-    def _shut_out(self, weight: Image, outlier: Mask) -> Image:
-        # Judged in cells of 4 pixels, shut out within a smooth outline around these.
-        cells = outlier.view(np.uint8) * np.uint8(255)
-        full = cv2.resize(cells, self._size_wh, interpolation=cv2.INTER_LINEAR)
-        smooth = cv2.blur(full, _SMOOTH)
-        return np.asarray(cv2.copyTo(weight, cv2.inRange(smooth, 0, _HALF)), np.uint8)
+
+def _shut_out(weight: Image, outlier: Mask) -> Image:
+    # Judged in cells of 4 pixels, shut out within a smooth outline around these.
+    cells = outlier.view(np.uint8) * np.uint8(255)
+    size_wh = weight.shape[1], weight.shape[0]
+    smooth = cv2.blur(cv2.resize(cells, size_wh, interpolation=cv2.INTER_LINEAR), _SMOOTH)
+    return np.asarray(cv2.copyTo(weight, cv2.inRange(smooth, 0, _HALF)), np.uint8)
 
 
 def _without_holes(weights: Sequence[Image], judged: Sequence[Image]) -> tuple[Image, ...]:

@@ -20,13 +20,17 @@ from streamtrack.mosaic import gains
 from streamtrack.mosaic.picture_files import holds_alpha, most_side, open_picture
 from streamtrack.mosaic.stream import painting
 from streamtrack.mosaic.stream.bands import HALO, blended
-from streamtrack.mosaic.stream.consensus import Chooser, Tally
+from streamtrack.mosaic.stream.comparisons import Comparisons
+from streamtrack.mosaic.stream.consensus import Sample, Tally, choose
 from streamtrack.mosaic.stream.coverage import CellGrid
 from streamtrack.mosaic.stream.render import Renderer
-from streamtrack.mosaic.stream.tiles import Box
+from streamtrack.mosaic.stream.tiles import Box, common_box, grown, is_empty
 from streamtrack.mosaic.stream.views import View, ViewStore
 from streamtrack.settings import MosaicSettings
 from streamtrack.types import Image, Matrix, Size
+
+REACH = 128
+"""How far beyond a block, in pixels, votes are taken: things of that size are judged as a whole."""
 
 _UNIT = 64
 _PRIMARY_SHARES = (0.5, 0.25, 0.1)
@@ -127,6 +131,7 @@ class _Painter:
         cache = int(settings.max_memory_mb * 1e6 / 3)
         self._renderer = Renderer(store, layout.scale, cache, settings.warping)
         self._set_gains(store)
+        self._votes = Comparisons(self._renderer)
         self._primary = primaries(self._views)
         self._boxes = np.array(
             [painting.box_of(self._renderer.canvas_from_frame(v), v.size_wh) for v in self._views]
@@ -142,16 +147,19 @@ class _Painter:
 
     def block(self, box: Box) -> tuple[Image, Tally]:
         """Pixels (side, side, 4) of one block."""
-        wide = box[0] - HALO, box[1] - HALO, box[2] + HALO, box[3] + HALO
-        rows = self._touching(wide)
         side = self.side
         if not self._touching(box).size:
             return np.zeros((side, side, 4), np.uint8), Tally()
-        chooser = Chooser((side + 2 * HALO, side + 2 * HALO))
-        views = [self._views[row] for row in rows]
-        for _ in self._renderer.samples(views, wide, chooser, self._primary):
-            pass
-        choice = chooser.choice()
+        wide, voting = grown(box, HALO), grown(box, HALO + REACH)
+        views = [self._views[row] for row in self._touching(voting)]
+        small = self._votes.small(views, voting)
+        samples = []
+        for view, cells in zip(views, small, strict=True):
+            reach = painting.box_of(self._renderer.canvas_from_frame(view), view.size_wh)
+            is_seen = not is_empty(common_box(reach, wide))
+            pixels = self._renderer.warped(view, wide) if is_seen else None
+            samples.append(Sample(pixels, cells, view.number in self._primary, view.moment))
+        choice = choose(samples, self._votes.differs(views, voting), REACH // painting.SHRINK)
         if choice is None:
             return np.zeros((side, side, 4), np.uint8), Tally()
         inner = slice(HALO, HALO + side)

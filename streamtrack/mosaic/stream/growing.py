@@ -22,7 +22,6 @@ import numpy as np
 from streamtrack import geometry
 from streamtrack.closing import Closing
 from streamtrack.errors import OutputError
-from streamtrack.mosaic import gains
 from streamtrack.mosaic.spill import SpillFile
 from streamtrack.mosaic.stream import painting
 from streamtrack.mosaic.stream.canvas import Canvas
@@ -221,16 +220,8 @@ class StreamMosaic(Closing):
     def _paint(self, image: Image, view: View) -> None:
         """Paint what the canvas does not show yet; where they disagree it is judged later."""
         self._renderer.remember(view, painting.weighted(image, view.quads, self._scale))
-        canvas_from_frame = self._renderer.canvas_from_frame(view)
-        box = painting.box_of(canvas_from_frame, view.size_wh)
-        small = painting.shrunk(image, view.quads, canvas_from_frame, self._scale, box)
-        if view.doubts is not None:
-            doubts_from_frame = gains.thumb_matrix(view.doubts, view.size_wh)
-            from_doubts = canvas_from_frame @ geometry.inverted(doubts_from_frame)
-            small_from_doubts = geometry.scaling(1 / painting.SHRINK) @ from_doubts
-            x0, y0, x1, y1 = (side // painting.SHRINK for side in box)
-            small = painting.doubted(small, view.doubts, small_from_doubts, (x0, y0, x1, y1))
-        small = painting.with_gain(small, view.log_gain)
+        box = painting.box_of(self._renderer.canvas_from_frame(view), view.size_wh)
+        _, small = self._renderer.shrunk(view)
         seen = painting.compared(box, painting.quartered(self._canvas.read(box)), small)
         for part in seen.parts():
             new = self._renderer.warped(view, part)

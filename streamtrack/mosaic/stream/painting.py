@@ -153,19 +153,14 @@ def doubted(pixels: Image, doubts: Image, canvas_from_doubts: Matrix, box: Box) 
     return np.asarray(cv2.insertChannel(weight, pixels.copy(), 3), np.uint8)
 
 
-def shrunk(
-    image: Image, quads: Sequence[Points], canvas_from_frame: Matrix, scale: float, box: Box
-) -> Image:
-    """A frame as BGRW pixels in a box of a canvas of ``scale``, all at a quarter of the size."""
-    pixels = weighted(image, quads, scale / SHRINK)
-    factor = pixels.shape[1] / image.shape[1], pixels.shape[0] / image.shape[0]
-    small_from_pixels = (
-        geometry.scaling(1 / SHRINK)
-        @ canvas_from_frame
-        @ geometry.inverted(geometry.scaling(*factor))
-    )
-    x0, y0, x1, y1 = (side // SHRINK for side in box)
-    return warped(pixels, small_from_pixels, (x0, y0, x1, y1))
+def shrunk(pixels: Image) -> Image:
+    """Pixels of any size at a quarter of it, in whole pixels."""
+    return _resized(pixels, scaled_size((pixels.shape[1], pixels.shape[0]), 1 / SHRINK))
+
+
+def quarter(box: Box) -> Box:
+    """A box of whole blocks of 4 x 4 pixels, in such blocks."""
+    return box[0] // SHRINK, box[1] // SHRINK, box[2] // SHRINK, box[3] // SHRINK
 
 
 def with_gain(pixels: Image, log_gain: npt.NDArray[np.float64]) -> Image:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ from streamtrack import geometry
 from streamtrack.mosaic import gains
 from streamtrack.mosaic.stream import painting
 from streamtrack.mosaic.stream.consensus import Chooser
-from streamtrack.mosaic.stream.tiles import Box, common_box
+from streamtrack.mosaic.stream.tiles import Box, common_box, is_empty
 from streamtrack.mosaic.stream.views import View, ViewStore
 from streamtrack.settings import Warping
 from streamtrack.types import Image, Matrix
@@ -46,26 +46,22 @@ class Renderer:
         """Where a view lies in the picture that is rendered."""
         return geometry.scaling(self._scale) @ view.world_from_frame
 
-    def samples(
-        self,
-        views: Iterable[View],
-        box: Box,
-        chooser: Chooser,
-        primary: Container[int] | None = None,
-    ) -> Iterator[None]:
-        """Hand the views' pixels in ``box`` to the chooser, one at each step.
-
-        ``primary`` has the numbers of the views that come before the others; None: all are equal.
-        """
+    def samples(self, views: Iterable[View], box: Box, chooser: Chooser) -> Iterator[None]:
+        """Hand the views' pixels in ``box`` to the chooser, one at each step."""
         for view in views:
             if view.number not in self._store.views:
                 continue  # dropped since the work began
             reach = painting.box_of(self.canvas_from_frame(view), view.size_wh)
-            x0, y0, x1, y1 = reach
-            if x0 < box[2] and x1 > box[0] and y0 < box[3] and y1 > box[1]:
-                is_primary = primary is None or view.number in primary
-                chooser.add(self.warped(view, box), is_primary, view.moment)
+            if not is_empty(common_box(reach, box)):
+                chooser.add(self.warped(view, box), view.moment)
                 yield
+
+    def shrunk(self, view: View) -> tuple[Box, Image]:
+        """All that a view shows, at a quarter of the size (BGRW), and where, in such pixels."""
+        matrix = geometry.scaling(1 / painting.SHRINK) @ self.canvas_from_frame(view)
+        box = painting.quarter(painting.box_of(self.canvas_from_frame(view), view.size_wh))
+        small = painting.shrunk(self._pixels(view))
+        return box, self._seen(view, small, matrix, box, cv2.INTER_LINEAR)
 
     def remember(self, view: View, pixels: Image) -> None:
         """Keep a view's pixels, `painting.weighted` at min(1, scale), as if it were decoded."""
@@ -83,28 +79,34 @@ class Renderer:
     def warped(self, view: View, box: Box) -> Image:
         """A view in a box of the picture (H, W, 4); only the part that it reaches is warped."""
         pixels, matrix = self._pixels(view), self.canvas_from_frame(view)
-        x0, y0, x1, y1 = common_box(painting.box_of(matrix, view.size_wh), box)
+        part = common_box(painting.box_of(matrix, view.size_wh), box)
         result = np.zeros((box[3] - box[1], box[2] - box[0], 4), np.uint8)
-        if x0 >= x1 or y0 >= y1:
+        if is_empty(part):
             return result
+        into = slice(part[1] - box[1], part[3] - box[1]), slice(part[0] - box[0], part[2] - box[0])
+        result[into] = self._seen(view, pixels, matrix, part, self._flags)
+        return result
+
+    def _seen(
+        self, view: View, pixels: Image, picture_from_frame: Matrix, box: Box, flags: int
+    ) -> Image:
+        """A view's pixels, of whatever size, in a box of the picture."""
         factor = pixels.shape[1] / view.size_wh[0], pixels.shape[0] / view.size_wh[1]
-        matrix = matrix @ geometry.inverted(geometry.scaling(*factor))
-        part = painting.warped(pixels, matrix, (x0, y0, x1, y1), self._flags)
-        if self._flags in (cv2.INTER_CUBIC, cv2.INTER_LANCZOS4):
+        matrix = picture_from_frame @ geometry.inverted(geometry.scaling(*factor))
+        part = painting.warped(pixels, matrix, box, flags)
+        if flags in (cv2.INTER_CUBIC, cv2.INTER_LANCZOS4):
             # Wide kernels ring at the frame's edge, where colours would fall to black.
-            into_part = geometry.translation(-x0, -y0) @ matrix
+            into_part = geometry.translation(-box[0], -box[1]) @ matrix
             size = part.shape[1], part.shape[0]
             kept = cv2.warpPerspective(
-                pixels, into_part, size, flags=self._flags, borderMode=cv2.BORDER_REPLICATE
+                pixels, into_part, size, flags=flags, borderMode=cv2.BORDER_REPLICATE
             )
             part[..., :3] = kept[..., :3]
-        into = slice(y0 - box[1], y1 - box[1]), slice(x0 - box[0], x1 - box[0])
         if view.doubts is not None:
             doubts_from_frame = gains.thumb_matrix(view.doubts, view.size_wh)
-            from_doubts = self.canvas_from_frame(view) @ geometry.inverted(doubts_from_frame)
-            part = painting.doubted(part, view.doubts, from_doubts, (x0, y0, x1, y1))
-        result[into] = painting.with_gain(part, view.log_gain)
-        return result
+            from_doubts = picture_from_frame @ geometry.inverted(doubts_from_frame)
+            part = painting.doubted(part, view.doubts, from_doubts, box)
+        return painting.with_gain(part, view.log_gain)
 
     def _pixels(self, view: View) -> Image:
         pixels = self._decoded.get(view.number)

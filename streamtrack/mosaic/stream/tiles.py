@@ -40,13 +40,23 @@ def tile_box(key: TileKey) -> Box:
 
 
 def common_box(one: Box, other: Box) -> Box:
-    """What two boxes that overlap have in common."""
+    """What two boxes have in common; see `is_empty`."""
     return (
         max(one[0], other[0]),
         max(one[1], other[1]),
         min(one[2], other[2]),
         min(one[3], other[3]),
     )
+
+
+def grown(box: Box, by: int) -> Box:
+    """A box with so many pixels more on each side."""
+    return box[0] - by, box[1] - by, box[2] + by, box[3] + by
+
+
+def is_empty(box: Box) -> bool:
+    """Whether a box holds no pixel."""
+    return box[0] >= box[2] or box[1] >= box[3]
 
 
 class TileStore:

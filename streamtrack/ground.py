@@ -19,6 +19,7 @@ _LEAST_POINTS = 4
 _MIN_HEIGHT = 0.02
 """Of a triangle of three known points, against its longest side: flatter ones are a line."""
 _MOST_TRIED = 12  # points, of many
+_NEAREST_HORIZON_PX = 3.0
 _MAX_MISFIT = 0.05
 """Of the known points, RMS, against how far they spread: beyond it one of them is wrong."""
 
@@ -41,11 +42,15 @@ class Ground:
     rmse: float = 0.0
 
     def positions(self, world: npt.ArrayLike) -> Doubles:
-        """Positions (N, 2) of world points (N, 2), NaN beyond the horizon."""
+        """Positions (N, 2) of world points (N, 2), NaN beyond the horizon and right before it.
+
+        There a pixel more or less is all of the way to what is seen.
+        """
         points = np.asarray(world, np.float64).reshape(-1, 2)
         found = points @ self.ground_from_world[:, :2].T + self.ground_from_world[:, 2]
-        depths = found[:, 2] * self.depth
-        places: Doubles = found[:, :2] / np.where(depths > 0, found[:, 2], np.nan)[:, None]
+        nearest = _NEAREST_HORIZON_PX * np.hypot(*self.ground_from_world[2, :2])
+        is_before = found[:, 2] * self.depth > nearest
+        places: Doubles = found[:, :2] / np.where(is_before, found[:, 2], np.nan)[:, None]
         return places
 
 
@@ -106,6 +111,8 @@ def fit_ground(world: Doubles, ground: Doubles) -> Ground:
     found = geometry.translation(*middle_ground) @ centred @ geometry.translation(*-middle)
     depth = float(np.sign(geometry.projective_depths(found, world)[0]))
     off = Ground(found, depth).positions(world) - ground
+    if not np.isfinite(off).all():
+        raise UsageError("--ground: a known point lies at the horizon: choose one that is nearer")
     rmse = float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
     spread = float(np.sqrt(np.mean(np.sum((ground - middle_ground) ** 2, axis=1))))
     if not rmse <= _MAX_MISFIT * spread:

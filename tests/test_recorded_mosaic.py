@@ -26,7 +26,16 @@ from streamtrack.recording import pictures as recorded_pictures
 from streamtrack.recording.pictures import record_picture_mosaic
 from streamtrack.recording.recorder import Recorder
 from streamtrack.settings import Settings, build_settings
-from streamtrack.types import CameraPose, Features, Matches, Model, Registration, Verdict
+from streamtrack.types import (
+    CameraPose,
+    Features,
+    Matches,
+    Model,
+    Registration,
+    Track,
+    TrackState,
+    Verdict,
+)
 from streamtrack.world import WorldMotion, crossing
 
 STRIPS = "LineStrips2D:strips"
@@ -275,6 +284,25 @@ def test_a_growing_picture_keeps_its_size_and_what_is_drawn_its_place(tmp_path):
         x, y, width, height = cv2.boundingRect((shown > 127).astype(np.uint8))
         expected = box_quad(x - 0.5, y - 0.5, width, height)
         np.testing.assert_allclose(outline[0][:4], expected, atol=1.0)
+
+
+def test_the_table_of_tracks_never_shows_what_is_over(tmp_path):
+    path = tmp_path / "tracks.rrd"
+    with Recorder(path, source(), Settings(), []) as recorder:
+        for index in range(60):
+            tracks = (replace(tracked("a", index), is_found=True),) if 6 <= index < 40 else ()
+            if index in (16, 17, 18):
+                tracks = (Track("a", TrackState.LOST, reason="hidden", is_found=True),)
+            recorder.log(replace(step_of(index, ()), tracks=tracks))
+    frames, tables = rrd_columns(path, "/tracks", "TextDocument:text")
+    for index in range(60):
+        now = [text for frame, (text,) in zip(frames, tables, strict=True) if frame <= index]
+        if 21 <= index < 40:
+            assert "tracking" in now[-1]
+        elif index == 18:
+            assert "hidden" in now[-1]
+        elif index >= 45:
+            assert now[-1] == "no target now\n"
 
 
 def test_what_is_not_covered_takes_no_room(tmp_path):

@@ -684,11 +684,11 @@ def test_view_listens_on_loopback_only(recorded, monkeypatch, capsys):
     assert opened[0] in capsys.readouterr().out
 
 
-def view_names(part):
-    """The names of all views below a part of a layout."""
+def views_below(part):
+    """All views below a part of a layout."""
     if not isinstance(part, rrb.Container):
-        return [part.name]
-    return [name for one in part.contents for name in view_names(one)]
+        return [part]
+    return [view for one in part.contents for view in views_below(one)]
 
 
 @pytest.mark.parametrize(
@@ -703,7 +703,9 @@ def view_names(part):
 def test_the_layout_has_no_panel_that_stays_empty(names, finds_targets, has_tracks, curves):
     for world in blueprint.World:
         layout = blueprint.build((64, 48), names, "frame", world, finds_targets=finds_targets)
-        shown = view_names(layout.root_container)
+        views = views_below(layout.root_container)
+        assert len({id(view) for view in views}) == len(views)  # the viewer shows each only once
+        shown = [view.name for view in views]
         assert ("Tracks" in shown) == has_tracks
         counted = {"Features, matches, inliers", "Targets found"} & set(shown)
         assert curves in counted if curves else not counted

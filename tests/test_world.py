@@ -159,7 +159,7 @@ def test_nothing_is_placed_beyond_the_horizon() -> None:
     ground_from_world = np.array([[1, 0, -320], [0, 0, 500], [0, 0.01, -1.0]])
     pixels = np.array([[100, 400], [500, 400], [400, 200], [200, 200.0]])
     ground = fit_ground(pixels, Ground(ground_from_world).positions(pixels))
-    places = ground.positions([[300, 300], [300, 101], [300, 100], [300, 50]])
+    places = ground.positions([[300, 300], [300, 104], [300, 102], [300, 100], [300, 50]])
     assert np.isfinite(places[:2]).all() and np.isnan(places[2:]).all()
     world = WorldMotion(None, ground)
     found = placed(world, 0, box_at(300, 60), np.eye(3)).world
@@ -184,6 +184,10 @@ GOOD = ["0,0=0,0", "100,0=10,0", "100,100=10,10", "0,100=0,10"]
         ([*GOOD[:3], "50,0=5,0"], "no three are in a line"),
         (["0,0=0,0", "100,0=10,10", "100,100=10,0", "0,100=0,10"], "fits the known points"),
         ([*GOOD, "50,50=9,1"], "fits the known points"),
+        (
+            ["0,102=-16000,25000", "99,102=-11050,25000", "0,300=-160,250", "99,300=-110.5,250"],
+            "horizon",
+        ),
     ],
 )
 def test_known_points_that_cannot_be_right_are_refused(points: list[str], message: str) -> None:

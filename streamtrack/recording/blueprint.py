@@ -58,10 +58,10 @@ def build(
     states = [entities.state for _, entities in targets]
     states += [MOSAIC_STATE] if world is World.MOSAIC else []
     states += [SOURCE_STATE] if is_live else []
-    tracks = [_tracks_view()] if targets or finds_targets else []
+    has_tracks = bool(targets) or finds_targets
     lanes_share = [0.75 + 0.42 * min(len(states), 6)] if states else []
     camera = rrb.Vertical(
-        _camera_row(size_wh, targets, tracks, timeline),
+        _camera_row(size_wh, targets, _tracks(has_tracks), timeline),
         _curves(targets, [], is_live, finds_targets),
         *_lanes(states),
         row_shares=[6.0, 2.6, *lanes_share],
@@ -71,9 +71,9 @@ def build(
         return whole_layout(camera, timeline, is_following)
     around = rrb.Vertical(
         _camera_view(size_wh),
-        *tracks,
+        *_tracks(has_tracks),
         text_tabs(timeline),
-        row_shares=[3.0, *[2.4 for _ in tracks], 2.2],
+        row_shares=[3.0, *([2.4] if has_tracks else []), 2.2],
     )
     curves = [_curve("Mosaic", [f"{MOSAIC_CURVES}/**"])] if world is World.MOSAIC else []
     world_tab = rrb.Vertical(
@@ -115,8 +115,9 @@ def _lanes(states: Sequence[str]) -> list[rrb.StateTimelineView]:
     return [view] if states else []
 
 
-def _tracks_view() -> rrb.TextDocumentView:
-    return rrb.TextDocumentView(name="Tracks", origin=f"/{TRACKS}")
+def _tracks(has_tracks: bool) -> list[rrb.TextDocumentView]:
+    """A view of the table of tracks, one of its own for each tab, if there may be any."""
+    return [rrb.TextDocumentView(name="Tracks", origin=f"/{TRACKS}")] if has_tracks else []
 
 
 def whole_layout(root: Any, timeline: str, is_following: bool = False) -> rrb.Blueprint:

@@ -12,17 +12,22 @@ from streamtrack.recording.entities import TRACKS
 from streamtrack.types import Step, Track, TrackState
 
 _EVERY_S = 0.5
+_CHANGED_EVERY_S = 0.2
 _MOST_ROWS = 40
 
 
 class TracksTable:
-    """Records the table twice a second of the source's clock. The clock is set by the caller."""
+    """Records the table twice a second of the source's clock, and soon after a state has changed.
+
+    The clock is set by the caller.
+    """
 
     def __init__(self, stream: rr.RecordingStream, has_ground: bool) -> None:
         self._stream = stream
         self._has_ground = has_ground
         self._last_s = -math.inf
         self._seen: Counter[str] = Counter()
+        self._states: dict[str, TrackState] = {}
         self._frames = 0
 
     def begin(self) -> None:
@@ -35,8 +40,10 @@ class TracksTable:
         tracked = [track for track in step.tracks if track.state is TrackState.TRACKING]
         self._seen.update(track.name for track in tracked)
         time_s = step.frame.time_s
-        if step.tracks and not 0.0 <= time_s - self._last_s < _EVERY_S:
-            self._last_s = time_s
+        states = {track.name: track.state for track in step.tracks}
+        wait_s = _EVERY_S if states == self._states else _CHANGED_EVERY_S
+        if (states or self._states) and not 0.0 <= time_s - self._last_s < wait_s:
+            self._last_s, self._states = time_s, states
             self._stream.log(
                 TRACKS,
                 rr.TextDocument(self.markdown(step.tracks), media_type="text/markdown"),
@@ -52,6 +59,8 @@ class TracksTable:
         titles += ["frames seen", "why"]
         lines = [_line(titles), _line(["---"] * len(titles))]
         lines += [_line(self._cells(track)) for track in tracks[:_MOST_ROWS]]
+        if not tracks:
+            return "no target now\n"
         if len(tracks) > _MOST_ROWS:
             lines.append(f"\nand {len(tracks) - _MOST_ROWS} more")
         return "\n".join(lines) + "\n"

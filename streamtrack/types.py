@@ -202,7 +202,6 @@ class Verdict(StrEnum):
     AMBIGUOUS = "repeated texture, another place fits as well"
     OVERLAY = "only what stands still in both agrees: a stamp, a frame, dirt; the rest differs"
     STRETCHED = "frame would cover more than four times its area"
-    SHEARED = "most of the view moves by itself, and the rest would be sheared"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

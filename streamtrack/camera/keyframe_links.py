@@ -284,7 +284,9 @@ def adjust_all(draft: Draft) -> None:
     rmse_px = [link.rmse_px for link in links if np.isfinite(link.rmse_px)]
     if rmse_px:
         noise_px = _NOISE_SHARE * float(np.sqrt(np.mean(np.square(rmse_px))))
-        draft.expect(adjusted.expected_errors_px(noise_px))
+        expected_px = adjusted.expected_errors_px(noise_px)
+        if expected_px:  # else all links were dropped
+            draft.expect(expected_px)
 
 
 def adjust_around(draft: Draft) -> None:

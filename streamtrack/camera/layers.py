@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from streamtrack import geometry
-from streamtrack.camera.view_alignment import align
+from streamtrack.camera.view_alignment import align, align_near
 from streamtrack.camera.view_levels import USUAL, Floats, ReferenceView, ViewLevels, filled
 from streamtrack.camera.view_verdict import ViewAlignment
 from streamtrack.types import Mask, Matrix, Points, Verdict
@@ -28,6 +28,7 @@ _SURE_SHARE = 0.75  # of agreeing cells; above it no other motion can be the bac
 _RIVAL_SHARE = 0.5  # of its cells that must agree with another motion
 _LEAST_REST = 0.12  # of the view, to have a motion of its own
 _BETTER, _BETTER_LEVELS = 1.5, 2.0  # factor and grey levels by which another motion is worse
+_AS_MANY, _SHARPER = 0.8, 0.6  # of the cells that agree, and of what is unlike in them
 _EDGE_SHARE = 1 / 7  # of the view's sides
 _CLEARLY = 1.25
 _LEAST_PLACE = 0.004  # of the view, to be left out
@@ -71,7 +72,11 @@ class Doubts:
 
 
 def separated(
-    reference: ReferenceView, view: ViewLevels, found: ViewAlignment, hidden: Sequence[Points] = ()
+    reference: ReferenceView,
+    view: ViewLevels,
+    found: ViewAlignment,
+    hidden: Sequence[Points] = (),
+    guess: Matrix | None = None,
 ) -> Layers:
     """The background's alignment and what moves before it, by one that a part of a view agrees on.
 
@@ -81,6 +86,10 @@ def separated(
     assert found.reference_from_view is not None
     compared = _Compared(reference, view)
     one = compared.under(found.reference_from_view)
+    if guess is not None:
+        rival = align_near(reference, view, guess, hidden)
+        if _is_sharper(rival, found):
+            return Layers(rival, ())
     rest = one.is_seen & ~one.is_alike
     if np.count_nonzero(rest) < _LEAST_REST * rest.size:
         return Layers(found, compared.quads(rest))
@@ -97,6 +106,16 @@ def separated(
         return Layers(replace(found, verdict=Verdict.UNCERTAIN, reference_from_view=None), ())
     background, foreground = (found, by_other) if extents[0] > extents[1] else (rival, by_one)
     return Layers(background, compared.quads(foreground))
+
+
+def _is_sharper(rival: ViewAlignment, found: ViewAlignment) -> bool:
+    """Is about as much of the view much more alike under another alignment?
+
+    One that lies between two motions agrees with many places, and exactly with few.
+    """
+    if rival.reference_from_view is None or rival.inliers < _AS_MANY * found.inliers:
+        return False
+    return 1 - rival.correlation < _SHARPER * (1 - found.correlation)
 
 
 def _extent(places: Mask) -> float:

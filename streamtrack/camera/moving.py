@@ -10,22 +10,22 @@ any keyframe.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import hypot
 from typing import Protocol
 
 import numpy as np
 
 from streamtrack import geometry
+from streamtrack.camera.following import PointMotion, followed
 from streamtrack.camera.keyframe_links import LevelCache, NewKeyframe, link_of, overlapping
 from streamtrack.camera.keyframes import KeyframeGraph
 from streamtrack.camera.layers import Doubts, separated
 from streamtrack.camera.loops import LoopCloser
 from streamtrack.camera.picture_overlay import OverlayWatch
-from streamtrack.camera.placed import Placed, Sight
+from streamtrack.camera.placed import Placed, Sight, State
 from streamtrack.camera.relocalising import Relocaliser
-from streamtrack.camera.shear import ShearWatch
-from streamtrack.camera.view_alignment import align, align_exactly, align_near
+from streamtrack.camera.view_alignment import align, align_exactly
 from streamtrack.camera.view_levels import ReferenceView, ViewLevels
 from streamtrack.camera.view_verdict import ViewAlignment
 from streamtrack.fitting import fit
@@ -43,9 +43,7 @@ _MAX_LASTING_SIGMA_PX = 1.0  # of the corners; above it a keyframe holds too lit
 _MIN_SPACING = 3  # frames between keyframes that are taken for that alone
 _MIN_REUSED_OVERLAP = 0.8
 _MIN_TEXTURED_CELLS = 12
-_MAX_AREA_JUMP = 1.5
 _MAX_STRETCH = 4.0
-_MAX_STEPS_AHEAD = 8
 _MAX_LAST_OVERLAP = 0.9  # with its keyframe, of a view that is kept when the camera is lost
 _REFERENCES_KEPT = 6
 _MARGIN_PX = 8.0  # of the usual level, around the targets
@@ -70,32 +68,6 @@ class CameraEstimator(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _State:
-    """Where the camera was last known to be.
-
-    ``sight`` is what it saw there, ``placed`` how that was found out, None of the first frame.
-    ``step`` is the motion (last frame from next, a similarity) in ``step_s`` seconds, None if it is
-    not known.
-    """
-
-    keyframe: int
-    keyframe_from_frame: Matrix
-    sight: Sight
-    placed: Placed | None = None
-    step: Matrix | None = None
-    step_s: float = 0.0
-
-    def predicted(self, time_s: float) -> Matrix:
-        """keyframe_from_frame at a time, if the camera goes on as it went."""
-        if self.step is None:
-            return self.keyframe_from_frame
-        steps = (time_s - self.sight.time_s) / self.step_s if self.step_s > 0 else 1.0
-        count = min(_MAX_STEPS_AHEAD, max(0, round(steps)))
-        ahead = np.linalg.matrix_power(self.step, count)
-        return geometry.normalized(self.keyframe_from_frame @ ahead)
-
-
 class MovingCamera:
     """A camera that moves over a scene that is flat, or far, or seen from one place.
 
@@ -108,10 +80,9 @@ class MovingCamera:
         self._loops = LoopCloser(self.graph, is_live)
         self._relocaliser = Relocaliser(self.graph, settings)
         self._references: dict[int, ReferenceView] = {}
-        self._shear = ShearWatch()
         self._doubts = Doubts()
         self._overlay = OverlayWatch()
-        self._state: _State | None = None
+        self._state: State | None = None
 
     def update(self, view: FrameView, tracks: Sequence[Track]) -> CameraPose:
         """The camera's pose in the next frame; targets' quads are left out of account."""
@@ -123,14 +94,16 @@ class MovingCamera:
         sight = Sight(view, _outlines(tracks, view.levels), over.quads, over.shown)
         if state is None:
             return self._begin(sight)
-        placed = Placed(state.keyframe, self._follow(state, sight))
+        reference = self._reference(state.keyframe)
+        points = PointMotion(reference, state, sight)
+        placed = Placed(state.keyframe, followed(reference, state, sight, points))
         if placed.keyframe_from_frame is None:
             self._keep_last_view(state)
             recognised = self._recognise(sight)
             if recognised is None:
                 return placed.refusal()
             placed = recognised
-        placed = self._background(placed, sight)
+        placed = self._background(placed, sight, points)
         if placed.keyframe_from_frame is None:
             return placed.refusal()
         self._relocaliser.rest()
@@ -147,8 +120,7 @@ class MovingCamera:
             return CameraPose(None, reason=str(Verdict.TOO_FEW_FEATURES))
         index = sight.index
         self._take(sight.view, reference, np.eye(3), None)
-        self._shear.begin(index)
-        self._state = _State(index, np.eye(3), sight)
+        self._state = State(index, np.eye(3), sight)
         return CameraPose(
             np.eye(3),
             cells,
@@ -160,24 +132,7 @@ class MovingCamera:
             overlay=sight.overlay,
         )
 
-    def _follow(self, state: _State, sight: Sight) -> ViewAlignment:
-        """The frame against the keyframe of the frame before, where the motion leads or leaves."""
-        reference = self._reference(state.keyframe)
-        levels, hidden, size_wh = sight.levels, sight.hidden, sight.size_wh
-        guess = state.predicted(sight.time_s)
-        if state.step is not None:
-            found = _without_jump(align_near(reference, levels, guess, hidden), guess, size_wh)
-            if found.reference_from_view is not None:
-                return found
-        found = _without_jump(align(reference, levels, guess, hidden), guess, size_wh)
-        if found.reference_from_view is not None:
-            return found
-        guess = state.keyframe_from_frame
-        searched = align(reference, levels, guess, hidden, is_searched=True)
-        searched = _without_jump(searched, guess, size_wh)
-        return found if searched.reference_from_view is None else searched
-
-    def _keep_last_view(self, state: _State) -> None:
+    def _keep_last_view(self, state: State) -> None:
         """The frame last placed becomes a keyframe, as it may show most of what a jump left."""
         placed, sight = state.placed, state.sight
         if placed is None or placed.overlap(sight) >= _MAX_LAST_OVERLAP:
@@ -194,16 +149,17 @@ class MovingCamera:
                 return Placed(keyframe, found)
         return None
 
-    def _background(self, placed: Placed, sight: Sight) -> Placed:
+    def _background(self, placed: Placed, sight: Sight, points: PointMotion) -> Placed:
         """The alignment of what lies behind, where the one found has doubtful support.
 
         What moves before it is left out of the keyframe from then on.
         """
-        keyframe, found = placed.keyframe, placed.found
+        keyframe, found, state = placed.keyframe, placed.found, self._state
+        assert state is not None
         if not self._doubts.are_due(keyframe, found):
             return placed
-        reference = self._reference(keyframe)
-        layers = separated(reference, sight.levels, found, sight.hidden)
+        guess = points.guess if keyframe == state.keyframe else None
+        layers = separated(self._reference(keyframe), sight.levels, found, sight.hidden, guess)
         self._hide(keyframe, layers.foreground)
         return Placed(keyframe, layers.background)
 
@@ -219,8 +175,6 @@ class MovingCamera:
     def _accepted(self, placed: Placed, sight: Sight) -> CameraPose:
         """The pose of a frame in a keyframe; goes over to another one where that is better."""
         keyframe, found = placed.keyframe, placed.found
-        if self._shear.is_sheared(keyframe, found, sight.size_wh):
-            return placed.camera_pose(None, Verdict.SHEARED)
         keyframe_from_frame = self.graph.lens.flat(found, sight.size_wh)
         world_from_frame = self._in_world(keyframe, keyframe_from_frame)
         before = self._state
@@ -259,9 +213,9 @@ class MovingCamera:
         if state is not None and is_later and state.keyframe == placed.keyframe:
             motion = geometry.inverted(state.keyframe_from_frame) @ placed.pose
             quad = geometry.image_quad(sight.size_wh)
-            step = fit(Model.SIMILARITY, quad, geometry.transform_points(motion, quad))
+            step = fit(Model.AFFINE, quad, geometry.transform_points(motion, quad))
             step_s = sight.time_s - state.sight.time_s
-        self._state = _State(placed.keyframe, placed.pose, sight, placed, step, step_s)
+        self._state = State(placed.keyframe, placed.pose, sight, placed, step, step_s)
 
     def _go_over(self, keyframe: int, keyframe_from_frame: Matrix) -> None:
         """Go on from another keyframe; the motion from frame to frame stays."""
@@ -297,7 +251,7 @@ class MovingCamera:
                 return other
         return None
 
-    def _extend(self, placed: Placed, sight: Sight, before: _State | None) -> bool:
+    def _extend(self, placed: Placed, sight: Sight, before: State | None) -> bool:
         """Take the frame as a keyframe if it is sharp and its place beyond doubt.
 
         It is measured exactly later, unless so little agrees that it must be done at once.
@@ -321,12 +275,11 @@ class MovingCamera:
             keyframe_from_frame = geometry.inverted(lens.flat(exact, size_wh))
             link = link_of(keyframe, index, exact)
         self._take(sight.view, reference, self._in_world(keyframe, keyframe_from_frame), link)
-        self._shear.extend(keyframe, found, index)
         self._go_over(index, np.eye(3))
         self._loops.add(NewKeyframe(index, reference, keyframe, found if is_sure else None))
         return True
 
-    def _new_reference(self, placed: Placed, sight: Sight, before: _State | None) -> ReferenceView:
+    def _new_reference(self, placed: Placed, sight: Sight, before: State | None) -> ReferenceView:
         """The view of a new keyframe, without what has moved by itself since the frame before."""
         levels, hidden = sight.levels, sight.hidden
         reference = ReferenceView(levels, hidden)
@@ -375,18 +328,6 @@ def _outlines(tracks: Sequence[Track], levels: ViewLevels) -> list[Points]:
 def _is_lasting(found: ViewAlignment) -> bool:
     """Is most of what a keyframe showed still there?"""
     return found.inliers >= _MIN_LASTING_SHARE * len(found.is_inlier)
-
-
-def _without_jump(found: ViewAlignment, guess: Matrix, size_wh: Size) -> ViewAlignment:
-    """The alignment, refused if the view's area is not about what was expected."""
-    if found.reference_from_view is None:
-        return found
-    quad = geometry.image_quad(size_wh)
-    area = geometry.signed_area(geometry.transform_points(found.reference_from_view, quad))
-    expected = geometry.signed_area(geometry.transform_points(guess, quad))
-    if 1 / _MAX_AREA_JUMP <= area / expected <= _MAX_AREA_JUMP:
-        return found
-    return replace(found, verdict=Verdict.AREA, reference_from_view=None)
 
 
 def _stretch(world_from_frame: Matrix, size_wh: Size) -> float:

@@ -1,4 +1,4 @@
-"""A frame as the camera's motion is asked of it, and what it came to."""
+"""A frame as the camera's motion is asked of it, what it came to, and what is expected next."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from streamtrack.camera.view_levels import ViewLevels
 from streamtrack.camera.view_verdict import ViewAlignment
 from streamtrack.frame_view import FrameView
 from streamtrack.types import CameraPose, Matrix, Points, Size, Verdict
+
+_MAX_STEPS_AHEAD = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,3 +88,29 @@ class Placed:
         found = self.found
         reason = str(found.verdict).replace("the target", "the keyframe").replace("target", "view")
         return CameraPose(None, len(found.is_inlier), found.inliers, reason=reason)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Where the camera was last known to be.
+
+    ``sight`` is what it saw there, ``placed`` how that was found out, None of the first frame.
+    ``step`` is the motion (last frame from next, a similarity) in ``step_s`` seconds, None if it is
+    not known.
+    """
+
+    keyframe: int
+    keyframe_from_frame: Matrix
+    sight: Sight
+    placed: Placed | None = None
+    step: Matrix | None = None
+    step_s: float = 0.0
+
+    def predicted(self, time_s: float) -> Matrix:
+        """keyframe_from_frame at a time, if the camera goes on as it went."""
+        if self.step is None:
+            return self.keyframe_from_frame
+        steps = (time_s - self.sight.time_s) / self.step_s if self.step_s > 0 else 1.0
+        count = min(_MAX_STEPS_AHEAD, max(0, round(steps)))
+        ahead = np.linalg.matrix_power(self.step, count)
+        return geometry.normalized(self.keyframe_from_frame @ ahead)

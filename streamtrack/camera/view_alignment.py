@@ -13,7 +13,6 @@ The outcome is judged cell by cell (see `view_verdict`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TypeAlias
 
 import cv2
@@ -52,7 +51,6 @@ _MIN_SHAPE_SHARE = 0.6  # of agreeing cells, for a mapping richer than a similar
 _MIN_STIFF_SHARE = 0.85  # of its agreeing cells that a similarity must keep
 _MAX_STIFF_UNLIKE = 1.25  # and the factor by which they may be less alike
 _SHORT_PX = 0.5  # of the usual level: a step that needs no coarser level before it
-_NEAR_SHARE = 0.015  # of the view: as far a guess may be off where coarse levels are left out
 _SEARCH_SHARE = 0.3  # of the view: how far the search for a shift reaches
 
 _SIMILARITY, _AFFINE = MODEL_BASES[Model.SIMILARITY], MODEL_BASES[Model.AFFINE]
@@ -89,8 +87,7 @@ def align_near(
 ) -> ViewAlignment:
     """As `align`, from a guess that is right to a few pixels: without the coarser levels.
 
-    At the usual level alone if its steps are short. An alignment that ends farther from its guess
-    than that is refused as uncertain.
+    At the usual level alone if its steps are short.
     """
     try:
         start = geometry.inverted(guess)
@@ -98,18 +95,9 @@ def align_near(
         return refusal(Verdict.MIRRORED)
     fitted = _fit(reference, view, USUAL, start, hidden, most_px=_SHORT_PX)
     if fitted is not None:
-        found = _stiffened(reference, view, start, fitted, hidden)
-    else:
-        coarsest = min(USUAL + 1, len(reference.levels.images) - 1, len(view.images) - 1)
-        found = _descended(reference, view, start, hidden, coarsest)
-    if found.reference_from_view is None:
-        return found
-    corners = geometry.image_quad(view.size_wh)
-    ends = (geometry.transform_points(m, corners) for m in (guess, found.reference_from_view))
-    moved_px = float(np.abs(np.subtract(*ends)).max())
-    if moved_px <= _NEAR_SHARE * view.size_wh[0]:
-        return found
-    return replace(found, verdict=Verdict.UNCERTAIN, reference_from_view=None)
+        return _stiffened(reference, view, start, fitted, hidden)
+    coarsest = min(USUAL + 1, len(reference.levels.images) - 1, len(view.images) - 1)
+    return _descended(reference, view, start, hidden, coarsest)
 
 
 def _descended(

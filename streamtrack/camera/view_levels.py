@@ -144,7 +144,9 @@ def filled(quads: Sequence[Points], picture_from_view: Matrix, shape: tuple[int,
     return inside > 0
 
 
-def fill(picture: Image, quads: Sequence[Points], picture_from_view: Matrix, value: int) -> None:
+def fill(
+    picture: Image | Floats, quads: Sequence[Points], picture_from_view: Matrix, value: int
+) -> None:
     """Set the pixels (h, w) that lie in quads (4, 2) of a view; not finite ones are none."""
     for quad in quads:
         seen = geometry.transform_points(picture_from_view, quad)

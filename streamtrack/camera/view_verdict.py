@@ -7,6 +7,7 @@ point pairs on which the verdict rests.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import log
 from typing import TypeAlias
 
 import cv2
@@ -62,6 +63,16 @@ class ViewAlignment:
     @property
     def inliers(self) -> int:
         return int(np.count_nonzero(self.is_inlier))
+
+    @property
+    def support(self) -> float:
+        """What the agreeing cells tell of each other in both views: nats a pixel, over the cells.
+
+        Mutual information of Gaussian values (Cover & Thomas 2006, section 8.5): a mapping that
+        lies between two motions agrees with many cells, and exactly with few.
+        """
+        unlike = max(1 - self.correlation**2, 1e-3)
+        return -0.5 * self.inliers * log(unlike) if self.inliers else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

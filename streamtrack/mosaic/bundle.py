@@ -210,8 +210,8 @@ def _weights(problem: Problem, errors: Doubles, rejection: _Rejection) -> Double
     """What each pair (2 L, K) counts, a square pixel's worth."""
     noise_px = estimated_noise_px(problem, errors)
     # The mean of n pairs is worth n of them, as far as their errors are independent.
-    alone = errors * np.sqrt(problem.counts)
     with np.errstate(divide="ignore", invalid="ignore"):
+        alone = errors * np.sqrt(problem.counts)  # no pair, and its place at infinity: NaN
         huber = np.nan_to_num(np.minimum(1.0, 2 * _HUBER * noise_px / alone))
     of_link = rejection.weights(errors)
     both = np.concatenate([of_link, of_link])[:, None]

@@ -111,8 +111,6 @@ def fit_ground(world: Doubles, ground: Doubles) -> Ground:
     found = geometry.translation(*middle_ground) @ centred @ geometry.translation(*-middle)
     depth = float(np.sign(geometry.projective_depths(found, world)[0]))
     off = Ground(found, depth).positions(world) - ground
-    if not np.isfinite(off).all():
-        raise UsageError("--ground: a known point lies at the horizon: choose one that is nearer")
     rmse = float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
     spread = float(np.sqrt(np.mean(np.sum((ground - middle_ground) ** 2, axis=1))))
     if not rmse <= _MAX_MISFIT * spread:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -58,6 +58,17 @@ class WorldPath:
             self._in_frame[row], self._positions[row] = in_frame, position
             self._revisions[row] = 0 if self._graph is None else self._graph.revision
             self._count += 1
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies and pickles: positions as they are known now, which then stay."""
+        with self._lock:
+            self._follow_keyframes(range(self._count))
+            columns = {name: column[: self._count] for name, column in self._columns().items()}
+            return {"_graph": None, "_count": self._count, **columns}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._lock = threading.Lock()
 
     def _columns(self) -> dict[str, npt.NDArray[np.generic]]:
         names = ("_frames", "_times_s", "_in_frame", "_positions", "_revisions")

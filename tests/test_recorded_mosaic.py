@@ -297,7 +297,7 @@ def test_the_table_of_tracks_never_shows_what_is_over(tmp_path):
     frames, tables = rrd_columns(path, "/tracks", "TextDocument:text")
     for index in range(60):
         now = [text for frame, (text,) in zip(frames, tables, strict=True) if frame <= index]
-        if 21 <= index < 40:
+        if 23 <= index < 40:
             assert "tracking" in now[-1]
         elif index == 18:
             assert "hidden" in now[-1]

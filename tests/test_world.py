@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+import pickle
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -184,10 +186,6 @@ GOOD = ["0,0=0,0", "100,0=10,0", "100,100=10,10", "0,100=0,10"]
         ([*GOOD[:3], "50,0=5,0"], "no three are in a line"),
         (["0,0=0,0", "100,0=10,10", "100,100=10,0", "0,100=0,10"], "fits the known points"),
         ([*GOOD, "50,50=9,1"], "fits the known points"),
-        (
-            ["0,102=-16000,25000", "99,102=-11050,25000", "0,300=-160,250", "99,300=-110.5,250"],
-            "horizon",
-        ),
     ],
 )
 def test_known_points_that_cannot_be_right_are_refused(points: list[str], message: str) -> None:
@@ -209,6 +207,22 @@ def test_known_points_that_cannot_be_right_are_refused(points: list[str], messag
 def test_settings_that_cannot_be_right_are_refused(world: dict[str, object]) -> None:
     with pytest.raises(UsageError):
         build_settings({"world": world})
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda step: pickle.loads(pickle.dumps(step))])
+def test_steps_can_be_kept_and_sent_elsewhere(
+    copied: Callable[[Step], Step], make_picture: MakePicture
+) -> None:
+    wide = make_picture(31, (500, 300))
+    frames = [Frame(n, n / HZ, np.ascontiguousarray(_view(wide, 4 * n)), "") for n in range(6)]
+    settings = build_settings({"camera": "moving"})
+    target = Target("poster", geometry.box_quad(180, 60, 110, 90))
+    for step in track(FrameList(frames), [target], settings):
+        there = copied(step)
+        np.testing.assert_array_equal(there.frame.image, step.frame.image)
+        assert step.tracks[0].world is not None and there.tracks[0].world is not None
+        np.testing.assert_array_equal(there.tracks[0].world.path, step.tracks[0].world.path)
+        assert len(there.tracks[0].world.path) == step.frame.index + 1
 
 
 def test_tables_hold_the_ground_after_the_world(tmp_path: Path) -> None:

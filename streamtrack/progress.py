@@ -128,4 +128,4 @@ def _states(step: Step) -> str:
     tracked = sum(track.state is TrackState.TRACKING for track in step.tracks)
     if len(step.tracks) == 1:
         return f"{step.tracks[0].name} {step.tracks[0].state}"
-    return f"{tracked} of {len(step.tracks)} targets tracked"
+    return f"{tracked} of {len(step.tracks)} targets tracked" if step.tracks else "no target"

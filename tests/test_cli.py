@@ -406,6 +406,28 @@ def test_broken_pipe_ends_quietly(clip: Path, target: str, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
+    ("redirected", "code", "said"),
+    [
+        ("> /dev/full", 1, "no space left on device"),
+        (">&-", 0, ""),
+        ("2>&-", 0, ""),
+        (">&- 2>&-", 0, ""),
+    ],
+)
+def test_output_that_cannot_be_written_is_one_line(
+    clip: Path, tmp_path: Path, redirected: str, code: int, said: str
+) -> None:
+    flags = f"track {clip} --no-record --poses p.csv --frames 3"
+    command = f"exec {sys.executable} -m streamtrack.cli {flags} {redirected}"
+    result = subprocess.run(
+        command, shell=True, cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == code
+    assert "Traceback" not in result.stderr and said in result.stderr
+    assert len(rows_of(tmp_path / "p.csv")) == 3
+
+
+@pytest.mark.parametrize(
     "flags",
     [
         ["--video", "{clip}"],

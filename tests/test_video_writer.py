@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -179,3 +182,38 @@ def test_writing_on_after_a_failure_is_refused(tmp_path: Path) -> None:
             writer.write(picture(i), i / 25)
     with pytest.raises(OutputError, match="cannot go on writing"):
         writer.write(picture(0), 9)
+
+
+_CHILD = """
+import os, resource, sys
+import numpy as np
+from streamtrack.errors import OutputError
+from streamtrack.sources.writer import VideoWriter
+
+if sys.argv[2] == "full":
+    resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000))
+rng = np.random.default_rng(0)
+with VideoWriter(sys.argv[1], rate_hz=25) as writer:
+    for n in range(200):
+        try:
+            writer.write(rng.integers(0, 255, (48, 64), np.uint8), n / 25)
+        except OutputError:
+            sys.exit(3)
+    if sys.argv[2] == "killed":
+        os.kill(os.getpid(), 9)
+"""
+
+
+@pytest.mark.parametrize(("how", "code"), [("killed", -9), ("full", 3), ("closed", 0)])
+@pytest.mark.parametrize("name", ["a.mp4", "a.mov", "a.mkv"])
+def test_what_was_written_until_a_bad_end_can_be_played(
+    tmp_path: Path, name: str, how: str, code: int
+) -> None:
+    path = tmp_path / name
+    command = [sys.executable, "-c", _CHILD, str(path), how]
+    assert subprocess.run(command, check=False).returncode == code
+    count = 0
+    with av.open(str(path)) as container, suppress(av.FFmpegError):  # the last may be cut in two
+        for _ in container.decode(video=0):
+            count += 1
+    assert count == 200 if how == "closed" else count >= 40

@@ -11,6 +11,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -72,6 +73,9 @@ def _program(commands: Iterable[str]) -> typer.Typer:
 
 def main() -> None:
     """Run the program."""
+    if sys.stdout is None or sys.stderr is None:  # closed by the shell: >&- 2>&-
+        nowhere = Path(os.devnull).open("w")  # noqa: SIM115
+        sys.stdout, sys.stderr = sys.stdout or nowhere, sys.stderr or nowhere
     # Rerun's own log lines: what matters of them is said in ours, in one line.
     os.environ.setdefault("RUST_LOG", "off")
     # Its allocator shall hand memory back at once: runs last for weeks.
@@ -122,10 +126,18 @@ def exit_on_error(run: Callable[[], Any]) -> None:
         _fail(error, 1)
     except (Abort, KeyboardInterrupt):
         _fail("interrupted", 1)
-    except BrokenPipeError:
-        # Nobody reads our output any more; keep Python from complaining while it shuts down.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # nobody reads our output any more
+        _drop_output()
         sys.exit(1)
+    except OSError as error:
+        _drop_output()
+        reason = (error.strerror or str(error)).lower()
+        _fail(f"cannot go on: {reason}; check the disks and where the output goes", 1)
+
+
+def _drop_output() -> None:
+    """Keep Python from complaining of what it cannot write while it shuts down."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _fail(message: object, code: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import cast
@@ -31,9 +31,10 @@ class _Coding:
     options: dict[str, str] = field(default_factory=dict)
     needs_even_size: bool = True
     has_fixed_rate: bool = False
+    container: dict[str, str] = field(default_factory=dict)
 
 
-_H264 = _Coding("libx264", "yuv420p", {"preset": "veryfast", "crf": "20"})
+_H264 = _Coding("libx264", "yuv420p", {"preset": "veryfast", "crf": "20", "g": "60"})
 _VP9 = _Coding(
     "libvpx-vp9",
     "yuv420p",
@@ -43,7 +44,9 @@ _MJPEG = _Coding(
     "mjpeg", "yuvj420p", {"flags": "+qscale", "global_quality": "354"}, has_fixed_rate=True
 )
 _FFV1 = _Coding("ffv1", "bgr0", {"level": "3", "slices": "4"}, needs_even_size=False)
-_CODINGS = {".mp4": _H264, ".mov": _H264, ".mkv": _H264, ".webm": _VP9, ".avi": _MJPEG}
+# What was written until a disk is full or the process killed can be played all the same.
+_MP4 = replace(_H264, container={"movflags": "+hybrid_fragmented"})
+_CODINGS = {".mp4": _MP4, ".mov": _MP4, ".mkv": _H264, ".webm": _VP9, ".avi": _MJPEG}
 
 
 class VideoWriter(Closing):
@@ -126,7 +129,7 @@ class VideoWriter(Closing):
 
     def _open(self, image: Image, time_s: float) -> None:
         coding = self._coding
-        self._container = av.open(f"file:{self._path}", "w")
+        self._container = av.open(f"file:{self._path}", "w", options=dict(coding.container))
         stream = cast(
             VideoStream,
             self._container.add_stream(coding.codec, rate=self._rate, options=dict(coding.options)),

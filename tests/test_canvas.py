@@ -346,6 +346,20 @@ def test_a_thing_that_has_the_votes_in_one_half_and_not_in_the_other_is_not_cut(
     np.testing.assert_array_equal(picture[..., 0], background)
 
 
+@pytest.mark.parametrize("is_thing_older", [False, True])
+def test_a_thing_that_stands_for_two_thirds_of_the_time_is_not_the_ground(
+    make_picture: MakePicture, is_thing_older: bool
+) -> None:
+    background = np.asarray(cv2.GaussianBlur(make_picture(6, (256, 256)), (0, 0), 4), np.uint8)
+    with_thing = background.copy()
+    with_thing[80:160, 80:176] = 245
+    samples = [bgrw(with_thing)] * 7 + [bgrw(background)] * 4
+    if not is_thing_older:
+        samples.reverse()
+    picture, _ = chosen(samples)
+    np.testing.assert_array_equal(picture[..., 0], background)
+
+
 def noisy_road(rng: np.random.Generator) -> Image:
     road = 60 + rng.normal(0, 2, (256, 256))
     road[120:124] += 60

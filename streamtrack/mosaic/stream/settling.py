@@ -1,17 +1,18 @@
 """Who is shown where, brought to order: of a thing all is shown, or nothing.
 
 A sample takes over a whole part in which it shows something else than what is shown now, if that
-has more votes, or leaves fewer borders that cut through a thing; with about as many votes, if it
-shows the ground there (regions of difference: Uyttendaele et al., "Eliminating ghosting and
-exposure artifacts in image mosaics", CVPR 2001; cost of visible seams: Agarwala et al.,
-"Interactive digital photomontage", SIGGRAPH 2004). What is the ground the outlines tell: a thing
-that lies on the ground ends at its outline, in colour and in edges, and the ground goes on. After
-the test for removed objects in video surveillance (Connell et al., "Detection and tracking in the
-IBM PeopleVision system", ICME 2004), made pairwise.
+has more votes, or leaves fewer borders that cut through a thing; with about as many votes, or
+clearly with half as many, if it shows the ground there. (Regions of difference: Uyttendaele et al.,
+"Eliminating ghosting and exposure artifacts in image mosaics", CVPR 2001; cost of visible seams:
+Agarwala et al., "Interactive digital photomontage", SIGGRAPH 2004.) What is the ground the outlines
+tell: a thing that lies on the ground ends at its outline, in colour and in edges, and the ground
+goes on. After the test for removed objects in video surveillance (Connell et al., "Detection and
+tracking in the IBM PeopleVision system", ICME 2004), made pairwise.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import TypeAlias
 
@@ -26,9 +27,11 @@ _CLOSE_VOTE, _CLOSE_BY = 0.6, 3.0  # votes of the leader's, or fewer by so many:
 _CUT_COST = 8.0  # votes of all for so many cells outweigh a cell's side that cuts a thing
 _MOST_OUTVOTED = 0.25  # share of the votes that a whole thing may lack, for all the cuts it saves
 _CUT_LEVELS = 30
+_FEW_CUTS = 0.5  # times the square root of a part's cells: at its outline not all is disputed
 _LEAST_GAIN = 1.0
 _MOST_ROUNDS = 4
-_CLEARLY = 1.15
+_CLEARLY, _VERY_CLEARLY = 1.15, 1.4
+_OUTVOTED = 0.4  # votes of the leader's, or more: what shows the ground very clearly
 _AROUND_LEVELS = 16.0
 _LEAST_AROUND = 12
 _LEAST_STEP = 6.0
@@ -100,26 +103,26 @@ class _Settlement:
         votes, leading = self._support[row][roi][part], self._leading[roi][part]
         gain = float((votes - leading).sum())
         now = int(self._cuts[roi].sum())
-        is_close = float(np.median(votes)) >= self._closeness * float(np.median(leading))
+        share = float(np.median(votes)) / max(float(np.median(leading)), 1e-6)
+        is_close = share >= _OUTVOTED
         if gain + min(_CUT_COST * now, _MOST_OUTVOTED * len(votes)) <= _LEAST_GAIN and not is_close:
             return False
         then = int(_cuts(self._samples[:, *roi], np.where(part, row, self._leader[roi])).sum())
         if gain + min(_CUT_COST * (now - then), _MOST_OUTVOTED * len(votes)) > _LEAST_GAIN:
             return True
-        if not is_close or then > now:
+        if not is_close or then - now > _FEW_CUTS * math.sqrt(len(votes)):
             return False
-        if not _is_ground(self._samples[row][roi], self._shown[roi], part, dissent, _CLEARLY):
+        clearly = _CLEARLY if share >= self._closeness else _VERY_CLEARLY
+        if not _is_ground(self._samples[row][roi], self._shown[roi], part, dissent, clearly):
             return False
         self._hold_down(row, roi, part)
         return True
 
     def _hold_down(self, row: int, roi: Roi, part: Mask) -> None:
-        """What disagrees with a sample in a part of the picture has no more votes than that."""
+        """What disagrees with a sample in a part of the picture has no votes there any more."""
         for (a, b), mask in self._differs.items():
             if row in (a, b):
-                rival = self._support[a + b - row][roi]
-                lower = part & mask[roi]
-                rival[lower] = np.minimum(rival[lower], self._support[row][roi][lower])
+                self._support[a + b - row][roi][part & mask[roi]] = 0.0
 
 
 def _cuts(samples: Image, leader: Leaders) -> npt.NDArray[np.uint8]:

@@ -78,3 +78,19 @@ def test_a_thing_that_goes_along_carries_nothing_away(seed: int, step: int, fram
         truth = source.truth(index).world_from_frame
         assert corner_error(pose.world_from_frame, truth, frame.size_wh) < 3
     camera.close()
+
+
+def test_a_truck_that_fills_the_view_is_not_taken_for_the_ground(make_picture: MakePicture) -> None:
+    """What comes in at the side, and hides three quarters: lost, or where it truly is."""
+    camera, extractor = MovingCamera(SETTINGS), FeatureExtractor(SETTINGS.features)
+    ground, truck = make_picture(8, (700, 240)), make_picture(9, (300, 210))
+    for n in range(36):
+        picture = np.ascontiguousarray(ground[:, 40 + 3 * n : 40 + 3 * n + SIZE[0]])
+        left = SIZE[0] - 22 * max(0, n - 6)
+        shown = picture[15:225, max(left, 0) : left + 300]
+        shown[:] = truck[:, max(-left, 0) :][:, : shown.shape[1]]
+        pose = camera.update(FrameView(Frame(n, n / 25, picture), extractor), ())
+        if pose.world_from_frame is not None:
+            assert corner_error(pose.world_from_frame, geometry.translation(3 * n, 0), SIZE) < 3
+    camera.close()
+    assert pose.world_from_frame is not None

@@ -7,13 +7,13 @@ alike at first; then whatever passes the gate from other starts is compared with
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from streamtrack import geometry
 from streamtrack.camera.frame_motion import guessed_motion
+from streamtrack.camera.layers import SURE_SHARE
 from streamtrack.camera.placed import Sight, State
 from streamtrack.camera.view_alignment import align, align_near
 from streamtrack.camera.view_levels import ReferenceView
@@ -51,7 +51,7 @@ def followed(
         if _is_expected(best, state, sight):
             return best
     best = _better(best, _without_jump(align(reference, levels, guess, hidden), guess, size_wh))
-    if _is_sure(best):
+    if best.reference_from_view is not None and is_majority(best):
         return best
     if points.guess is not None:
         found = align_near(reference, levels, points.guess, hidden)
@@ -61,6 +61,11 @@ def followed(
     guess = state.keyframe_from_frame
     found = align(reference, levels, guess, hidden, is_searched=True)
     return _better(best, _without_jump(found, guess, size_wh))
+
+
+def is_majority(found: ViewAlignment) -> bool:
+    """Whether most of what both views show agrees."""
+    return found.inliers >= _MAJORITY * len(found.is_inlier)
 
 
 def _is_expected(found: ViewAlignment, state: State, sight: Sight) -> bool:
@@ -73,17 +78,18 @@ def _is_expected(found: ViewAlignment, state: State, sight: Sight) -> bool:
     return float(np.abs(there - expected).max()) <= _NEAR_SHARE * sight.size_wh[0]
 
 
+def is_surprising(found: ViewAlignment, state: State, sight: Sight) -> bool:
+    """Whether a part of the view only says that a frame is not where the motion has led."""
+    if state.step is None or found.inliers >= SURE_SHARE * len(found.is_inlier):
+        return False
+    return not _is_expected(found, state, sight)
+
+
 def _better(one: ViewAlignment | None, other: ViewAlignment) -> ViewAlignment:
     """Of those that passed the gate the one with more support, else the last."""
     if one is None or one.reference_from_view is None:
         return other
     return one if other.reference_from_view is None or one.support >= other.support else other
-
-
-def _is_sure(found: ViewAlignment) -> bool:
-    return found.reference_from_view is not None and found.inliers >= _MAJORITY * len(
-        found.is_inlier
-    )
 
 
 def _without_jump(found: ViewAlignment, guess: Matrix, size_wh: Size) -> ViewAlignment:
@@ -95,4 +101,4 @@ def _without_jump(found: ViewAlignment, guess: Matrix, size_wh: Size) -> ViewAli
     expected = geometry.signed_area(geometry.transform_points(guess, quad))
     if 1 / _MAX_AREA_JUMP <= area / expected <= _MAX_AREA_JUMP:
         return found
-    return replace(found, verdict=Verdict.AREA, reference_from_view=None)
+    return found.refused(Verdict.AREA)

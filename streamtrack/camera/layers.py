@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -24,11 +24,12 @@ from streamtrack.types import Mask, Matrix, Points, Verdict
 
 _WINDOW, _SMALL_WINDOW = (5, 5), (3, 3)
 _ALIKE = 0.7  # correlation in a window from which a motion explains a place
-_SURE_SHARE = 0.75  # of agreeing cells; above it no other motion can be the background's
+SURE_SHARE = 0.75  # of agreeing cells; above it no other motion can be the background's
 _RIVAL_SHARE = 0.5  # of its cells that must agree with another motion
 _LEAST_REST = 0.12  # of the view, to have a motion of its own
 _BETTER, _BETTER_LEVELS = 1.5, 2.0  # factor and grey levels by which another motion is worse
 _AS_MANY, _SHARPER = 0.8, 0.6  # of the cells that agree, and of what is unlike in them
+_CONTRADICTING = 0.3  # of the view and of its edges, together
 _EDGE_SHARE = 1 / 7  # of the view's sides
 _CLEARLY = 1.25
 _LEAST_PLACE = 0.004  # of the view, to be left out
@@ -57,7 +58,7 @@ class Doubts:
 
         Ever more seldom, as what moves before a keyframe is left out of it from then on.
         """
-        if found.inliers >= _SURE_SHARE * len(found.is_inlier):
+        if found.inliers >= SURE_SHARE * len(found.is_inlier):
             return False
         self._frames[keyframe] += 1
         return self._frames[keyframe].bit_count() == 1
@@ -103,9 +104,23 @@ def separated(
     by_one, by_other = compared.better(one, other), compared.better(other, one)
     extents = _extent(by_one), _extent(by_other)
     if max(extents) < _CLEARLY * min(extents):
-        return Layers(replace(found, verdict=Verdict.UNCERTAIN, reference_from_view=None), ())
+        return Layers(found.refused(Verdict.UNCERTAIN), ())
     background, foreground = (found, by_other) if extents[0] > extents[1] else (rival, by_one)
     return Layers(background, compared.quads(foreground))
+
+
+def is_contradicted(
+    reference: ReferenceView, view: ViewLevels, found: ViewAlignment, expected: Matrix
+) -> bool:
+    """Does the place where a view was expected explain much of it that the one found does not?
+
+    Then the one found is rather that of a large thing which has come into view; a camera that
+    truly jerked shows nothing more where it would have been.
+    """
+    assert found.reference_from_view is not None
+    compared = _Compared(reference, view)
+    here, there = compared.under(found.reference_from_view), compared.under(expected)
+    return _extent(compared.better(there, here)) > _CONTRADICTING
 
 
 def _is_sharper(rival: ViewAlignment, found: ViewAlignment) -> bool:

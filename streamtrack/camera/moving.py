@@ -17,10 +17,10 @@ from typing import Protocol
 import numpy as np
 
 from streamtrack import geometry
-from streamtrack.camera.following import PointMotion, followed
+from streamtrack.camera.following import PointMotion, followed, is_majority, is_surprising
 from streamtrack.camera.keyframe_links import LevelCache, NewKeyframe, link_of, overlapping
 from streamtrack.camera.keyframes import KeyframeGraph
-from streamtrack.camera.layers import Doubts, separated
+from streamtrack.camera.layers import Doubts, is_contradicted, separated
 from streamtrack.camera.loops import LoopCloser
 from streamtrack.camera.picture_overlay import OverlayWatch
 from streamtrack.camera.placed import Placed, Sight, State
@@ -45,6 +45,7 @@ _MIN_REUSED_OVERLAP = 0.8
 _MIN_TEXTURED_CELLS = 12
 _MAX_STRETCH = 4.0
 _MAX_LAST_OVERLAP = 0.9  # with its keyframe, of a view that is kept when the camera is lost
+_SHAPE_SHARE = 0.006  # of the view, that a similarity must miss of a motion that has a shape
 _REFERENCES_KEPT = 6
 _MARGIN_PX = 8.0  # of the usual level, around the targets
 _MOST_LIVE_FRAMES = 200_000
@@ -156,10 +157,17 @@ class MovingCamera:
         """
         keyframe, found, state = placed.keyframe, placed.found, self._state
         assert state is not None
+        reference, levels = self._reference(keyframe), sight.levels
+        is_followed = keyframe == state.keyframe
+        if is_followed and is_surprising(found, state, sight):
+            expected = state.predicted(sight.time_s)
+            is_vague = state.is_old(sight.time_s) and not is_majority(found)
+            if is_vague or is_contradicted(reference, levels, found, expected):
+                return Placed(keyframe, found.refused(Verdict.UNCERTAIN))
         if not self._doubts.are_due(keyframe, found):
             return placed
-        guess = points.guess if keyframe == state.keyframe else None
-        layers = separated(self._reference(keyframe), sight.levels, found, sight.hidden, guess)
+        guess = points.guess if is_followed else None
+        layers = separated(reference, levels, found, sight.hidden, guess)
         self._hide(keyframe, layers.foreground)
         return Placed(keyframe, layers.background)
 
@@ -212,8 +220,7 @@ class MovingCamera:
         is_later = state is not None and sight.time_s > state.sight.time_s
         if state is not None and is_later and state.keyframe == placed.keyframe:
             motion = geometry.inverted(state.keyframe_from_frame) @ placed.pose
-            quad = geometry.image_quad(sight.size_wh)
-            step = fit(Model.AFFINE, quad, geometry.transform_points(motion, quad))
+            step = _simplified(motion, sight.size_wh)
             step_s = sight.time_s - state.sight.time_s
         self._state = State(placed.keyframe, placed.pose, sight, placed, step, step_s)
 
@@ -264,6 +271,8 @@ class MovingCamera:
             return False
         index = sight.index
         reference = self._new_reference(placed, sight, before)
+        if reference is None:
+            return False
         link = link_of(index, keyframe, found)
         is_sure = found.inliers >= _MIN_AGREEING_CELLS
         if not is_sure:
@@ -279,8 +288,13 @@ class MovingCamera:
         self._loops.add(NewKeyframe(index, reference, keyframe, found if is_sure else None))
         return True
 
-    def _new_reference(self, placed: Placed, sight: Sight, before: State | None) -> ReferenceView:
-        """The view of a new keyframe, without what has moved by itself since the frame before."""
+    def _new_reference(
+        self, placed: Placed, sight: Sight, before: State | None
+    ) -> ReferenceView | None:
+        """The view of a new keyframe, without what has moved by itself since the frame before.
+
+        None if it is not known which of two motions in it is the background's.
+        """
         levels, hidden = sight.levels, sight.hidden
         reference = ReferenceView(levels, hidden)
         keyframe = placed.keyframe
@@ -289,6 +303,8 @@ class MovingCamera:
         here_from_before = geometry.inverted(placed.pose) @ before.keyframe_from_frame
         ours = replace(placed.found, reference_from_view=here_from_before)
         layers = separated(reference, before.sight.levels, ours, hidden)
+        if layers.background.reference_from_view is None:
+            return None
         if layers.background is not ours or not layers.foreground:
             return reference
         self._doubts.go_on(sight.index)
@@ -328,6 +344,18 @@ def _outlines(tracks: Sequence[Track], levels: ViewLevels) -> list[Points]:
 def _is_lasting(found: ViewAlignment) -> bool:
     """Is most of what a keyframe showed still there?"""
     return found.inliers >= _MIN_LASTING_SHARE * len(found.is_inlier)
+
+
+def _simplified(motion: Matrix, size_wh: Size) -> Matrix:
+    """A motion from frame to frame as a similarity; as an affinity if that has clearly a shape.
+
+    What is added to a motion of fewer freedoms is noise, which grows when the motion is continued.
+    """
+    quad = geometry.image_quad(size_wh)
+    moved = geometry.transform_points(motion, quad)
+    similar = fit(Model.SIMILARITY, quad, moved)
+    off_px = float(np.abs(geometry.transform_points(similar, quad) - moved).max())
+    return fit(Model.AFFINE, quad, moved) if off_px > _SHAPE_SHARE * size_wh[0] else similar
 
 
 def _stretch(world_from_frame: Matrix, size_wh: Size) -> float:

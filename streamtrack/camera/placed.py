@@ -106,6 +106,10 @@ class State:
     step: Matrix | None = None
     step_s: float = 0.0
 
+    def is_old(self, time_s: float) -> bool:
+        """Whether frames have gone by since that could not be placed."""
+        return time_s - self.sight.time_s > 1.5 * self.step_s
+
     def predicted(self, time_s: float) -> Matrix:
         """keyframe_from_frame at a time, if the camera goes on as it went."""
         if self.step is None:

@@ -6,7 +6,7 @@ point pairs on which the verdict rests.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import log
 from typing import TypeAlias
 
@@ -63,6 +63,10 @@ class ViewAlignment:
     @property
     def inliers(self) -> int:
         return int(np.count_nonzero(self.is_inlier))
+
+    def refused(self, verdict: Verdict) -> ViewAlignment:
+        """The same, with a reason why it is not believed."""
+        return replace(self, verdict=verdict, reference_from_view=None)
 
     @property
     def support(self) -> float:

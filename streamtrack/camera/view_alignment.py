@@ -51,6 +51,7 @@ _MIN_SHAPE_SHARE = 0.6  # of agreeing cells, for a mapping richer than a similar
 _MIN_STIFF_SHARE = 0.85  # of its agreeing cells that a similarity must keep
 _MAX_STIFF_UNLIKE = 1.25  # and the factor by which they may be less alike
 _SHORT_PX = 0.5  # of the usual level: a step that needs no coarser level before it
+_SHORT_END = 0.2  # and how much shorter the last step must be
 _SEARCH_SHARE = 0.3  # of the view: how far the search for a shift reaches
 
 _SIMILARITY, _AFFINE = MODEL_BASES[Model.SIMILARITY], MODEL_BASES[Model.AFFINE]
@@ -226,7 +227,8 @@ def _fit(
 ) -> Fitted | None:
     """Gauss-Newton at one level from ``start`` (view_from_reference), or None.
 
-    None also if a step is longer than ``most_px``, in pixels of the level.
+    With ``most_px`` None also if a step is longer than that, in pixels of the level, or if the
+    steps come to no end: the start was too far off for this level alone.
     """
     values = view.high_passed(level)
     to_reference, to_view = reference.levels.level_from_view(level), view.level_from_view(level)
@@ -258,6 +260,8 @@ def _fit(
         moved_px = most * unit_px
         if moved_px < (_CONVERGED_PX if level <= USUAL else _CONVERGED_COARSE_PX):
             break
+    if moved_px > most_px * _SHORT_END:
+        return None
     found = geometry.inverted(to_view) @ mapping @ to_reference
     if not np.isfinite(found).all() or abs(found[2, 2]) < 1e-9:
         return None

@@ -7,7 +7,7 @@ import errno
 import json
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -211,6 +211,27 @@ def test_targets_are_not_painted(tmp_path: Path, make_picture: MakePicture) -> N
     inside = picture[5:-5, 100:-100, 0], land[5:-5, 100 : picture.shape[1] - 100]
     assert np.abs(inside[0].astype(int) - inside[1]).max() < 60  # noise of JPEG, no square (250)
     assert picture[45:75, 100:-100, 3].all()
+
+
+def test_what_is_found_late_to_lie_over_every_picture_is_taken_out_of_earlier_ones(
+    tmp_path: Path, make_picture: MakePicture
+) -> None:
+    land = make_picture(13, (400, 120))
+    logo = geometry.box_quad(60, 45, 30, 30)
+    with StreamMosaic(settings()) as mosaic:
+        for number in range(50):
+            x = 4 * number
+            image = moving_square(cut(land, x, 0), 60, 45, 30)
+            pose = replace(at(x, 0), overlay=(logo,) if number >= 20 else ())
+            mosaic.add(Frame(number, number / 30, image), pose)
+        mosaic.catch_up()
+        shown = mosaic.view().preview
+        mosaic.finish(tmp_path / "m.png")
+    picture = read(tmp_path / "m.png")
+    ground = land[5:-5, 100 : picture.shape[1] - 100].astype(int)
+    assert np.abs(picture[5:-5, 100:-100, 0] - ground).max() < 60  # no logo (250)
+    assert picture[45:75, 100:-100, 3].all()
+    assert shown.max() < 250
 
 
 def test_changes_of_light_leave_no_steps(tmp_path: Path, make_picture: MakePicture) -> None:

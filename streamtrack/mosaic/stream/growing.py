@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 
 from streamtrack import geometry
+from streamtrack.camera.view_levels import filled
 from streamtrack.closing import Closing
 from streamtrack.errors import OutputError
 from streamtrack.mosaic.spill import SpillFile
@@ -34,7 +35,7 @@ from streamtrack.mosaic.stream.views import View, ViewStore
 from streamtrack.mosaic.types import MosaicView
 from streamtrack.pose_graph import KeyframeEdge, PoseGraph
 from streamtrack.settings import MosaicSettings
-from streamtrack.types import CameraPose, Frame, Image, Matrix, Points, Track
+from streamtrack.types import CameraPose, Frame, Image, Matrix, Points, Size, Track
 
 NEW_SHARE = 0.15
 """A frame that sees this share of its area for the first time is painted at once."""
@@ -46,6 +47,7 @@ MOST_EXTENT_PX = 100_000.0
 """How far from its origin, in canvas pixels, a mosaic may reach."""
 
 _LEAST_SHARE = 0.01
+_LEAST_OVERLAID = 0.001  # of a frame; for less nothing is painted again
 _MOVED_PX = 0.5
 _CHECKED_A_FRAME, _MOVED_A_FRAME = 64, 3
 _SAMPLES_TO_JUDGE = 3
@@ -101,6 +103,8 @@ class StreamMosaic(Closing):
         self._keyframe_of: dict[int, int | None] = {}
         self._full = ""
         self._has_painted = False
+        self._overlay = b""
+        self._overlaid = np.zeros((0, 0), np.bool_)
         self.figures = StreamFigures()
 
     def close(self) -> None:
@@ -141,6 +145,7 @@ class StreamMosaic(Closing):
         if world_from_frame is not None:
             hidden = (*painting.target_quads(tracks), *pose.overlay)
             reason = self._place(frame, world_from_frame, hidden)
+            self._leave_out(pose.overlay, frame.size_wh)
         else:
             self._keep_waiting()
             if self._store is not None:
@@ -175,6 +180,24 @@ class StreamMosaic(Closing):
         elif need.new > max(_LEAST_SHARE, 0.0 if waiting is None else waiting.new):
             self._waiting = now
         return ""
+
+    def _leave_out(self, overlay: Sequence[Points], size_wh: Size) -> None:
+        """What is newly known to lie over every picture lay over those kept before as well."""
+        last, self._overlay = self._overlay, b"".join(quad.tobytes() for quad in overlay)
+        if not overlay or self._store is None or self._overlay == last:
+            return
+        small = geometry.scaling(1 / painting.SHRINK)
+        cells = (size_wh[1] // painting.SHRINK + 1, size_wh[0] // painting.SHRINK + 1)
+        known = self._overlaid if self._overlaid.shape == cells else np.zeros(cells, np.bool_)
+        covered = filled(overlay, small, cells)
+        if np.count_nonzero(covered & ~known) < _LEAST_OVERLAID * covered.size:
+            return
+        self._overlaid = known | covered
+        for view in self._store.views.values():
+            if view.size_wh == size_wh:
+                self._store.hide(view, overlay)
+                self._renderer.forget(view)
+                self._rerender.mark(self._store.tiles_of(view))
 
     def _begin(self, frame: Frame) -> None:
         """What depends on the size of the frames is made with the first of them."""

@@ -192,6 +192,12 @@ class ViewStore:
         view.cells = footprint(world_from_frame, view.size_wh, self._cell_px, view.quads)
         self._enter(view)
 
+    def hide(self, view: View, quads: Iterable[Points]) -> None:
+        """Say that quads (4, 2) of a view do not show the scene either."""
+        known = {quad.tobytes() for quad in view.quads}
+        view.quads += tuple(quad for quad in quads if quad.tobytes() not in known)
+        self.move(view, view.world_from_frame)
+
     def thin(self, around: View) -> list[View]:
         """Drop views near ``around`` that no place needs; returns them."""
         dropped: list[View] = []

@@ -300,7 +300,7 @@ def _camera_errors(scene: Scene, outcome: Outcome) -> npt.NDArray[np.float64]:
 
 
 def _target_line(scene: Scene, board: Board, outcome: Outcome) -> str:
-    errors, frame_errors, speeds = [], [], []
+    errors, frame_errors, speeds, ratios = [], [], [], []
     seen = 0
     for step in outcome.steps:
         n = step.frame.index
@@ -312,6 +312,7 @@ def _target_line(scene: Scene, board: Board, outcome: Outcome) -> str:
         if found.world is None:
             continue
         errors.append(np.linalg.norm(found.world.quad - scene.world_quad(board, n), axis=1).mean())
+        ratios.append(errors[-1] / max(found.world.sigma_px, 1e-9))
         if found.world.velocity_px_s is not None:
             true = _true_velocity(scene, board, n)
             speeds.append(np.hypot(*(found.world.velocity_px_s - true)) / RATE_HZ)
@@ -320,6 +321,7 @@ def _target_line(scene: Scene, board: Board, outcome: Outcome) -> str:
     return (
         f"known {len(errors)} of {seen} frames in view, world error mean {np.mean(errors):5.2f} "
         f"max {np.max(errors):5.2f} px (in the frame {np.mean(frame_errors):4.2f}), "
+        f"of that expected median {np.median(ratios):4.2f} p90 {np.percentile(ratios, 90):4.2f}, "
         f"speed error mean {np.mean(speeds):5.3f} p95 {np.percentile(speeds, 95):5.3f} "
         f"max {np.max(speeds):5.3f} px a frame"
     )

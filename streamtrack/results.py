@@ -46,9 +46,10 @@ class TrackRow(NamedTuple):
 
     Corners x1, y1 .. x4, y4 in full-resolution pixels, ``model`` and ``rmse_px`` are None unless
     the state is tracking (``rmse_px`` also where it was not estimated). ``world_x1 .. world_y4``
-    are the corners in pixels of the first keyframe and ``speed_px_s`` the speed there, None where
-    the camera's place is not known (the speed also in the first frames). The last three are in
-    the table only where a ground is given: place and speed in its units.
+    are the corners in pixels of the first keyframe, ``speed_px_s`` the speed there and
+    ``world_sigma_px`` the expected RMS error of these corners, None where the camera's place is
+    not known (the speed also in the first frames). The last three are in the table only where a
+    ground is given: place and speed in its units.
     """
 
     frame: int
@@ -76,6 +77,7 @@ class TrackRow(NamedTuple):
     world_x4: float | None
     world_y4: float | None
     speed_px_s: float | None
+    world_sigma_px: float | None
     ground_x: float | None
     ground_y: float | None
     speed_units_s: float | None
@@ -117,12 +119,13 @@ def _world_cells(track: Track) -> tuple[float | None, ...]:
     """The cells from ``world_x1`` on."""
     world = track.world
     if world is None:
-        return (None,) * 12
+        return (None,) * 13
     corners = [float(value) for value in world.quad.ravel()]
+    cells = (*corners, world.speed_px_s, _finite(world.sigma_px))
     if world.ground is None:
-        return (*corners, world.speed_px_s, None, None, None)
+        return (*cells, None, None, None)
     x, y = world.ground.position.tolist()
-    return (*corners, world.speed_px_s, x, y, world.ground.speed_units_s)
+    return (*cells, x, y, world.ground.speed_units_s)
 
 
 def _finite_quad(track: Track) -> list[float] | None:

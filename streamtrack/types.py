@@ -292,12 +292,15 @@ class WorldPlace:
     quad           float32 (4, 2), the corners in world pixels
     position       float64 (2,), where its diagonals cross
     velocity_px_s  float64 (2,), over the last half second (`mean_velocity`), None before frame 3
+    sigma_px       expected RMS error of the corners in world pixels, the camera's own drift and
+                   what the target's point pairs tell of it; NaN if the camera's is not known
     ground         its place in units, None without a scale or beyond the horizon
     """
 
     quad: Points
     position: npt.NDArray[np.float64]
     velocity_px_s: npt.NDArray[np.float64] | None
+    sigma_px: float
     ground: GroundPlace | None
     _path: _Path
     _frame: int

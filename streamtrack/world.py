@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 from dataclasses import replace
 from functools import lru_cache
+from math import hypot
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,7 @@ import numpy.typing as npt
 from streamtrack import geometry
 from streamtrack.ground import Ground
 from streamtrack.types import Frame, GroundPlace, Matrix, Points, Step, Track, WorldPlace
+from streamtrack.uncertainty import corner_sigmas_px
 
 if TYPE_CHECKING:
     from streamtrack.pose_graph import PoseGraph
@@ -29,6 +31,7 @@ _LEAST_IN_WINDOW = 5  # where frames come slowly
 _MOST_WINDOW_S = 2.0
 _MOST_IN_WINDOW = 24
 _MOST_POINTS = 4096
+_LEAST_POINT_SIGMA_PX = 0.1
 
 Doubles = npt.NDArray[np.float64]
 
@@ -136,10 +139,16 @@ class WorldMotion:
         world_from_frame = None if pose.warning else pose.world_from_frame
         if world_from_frame is None:
             return step
-        tracks = tuple(self._placed(frame, track, world_from_frame) for track in step.tracks)
+        # What is not moved is exactly where it is seen.
+        camera_sigma_px = 0.0 if np.array_equal(world_from_frame, np.eye(3)) else pose.sigma_px
+        tracks = tuple(
+            self._placed(frame, track, world_from_frame, camera_sigma_px) for track in step.tracks
+        )
         return replace(step, tracks=tracks)
 
-    def _placed(self, frame: Frame, track: Track, world_from_frame: Matrix) -> Track:
+    def _placed(
+        self, frame: Frame, track: Track, world_from_frame: Matrix, camera_sigma_px: float
+    ) -> Track:
         if track.quad is None:
             return track
         centre = crossing(track.quad)
@@ -154,7 +163,10 @@ class WorldMotion:
         times, positions = path.recent()
         velocity = mean_velocity(times, positions)
         ground = self._on_ground(position, times, positions)
-        return replace(track, world=WorldPlace(quad, position, velocity, ground, path, frame.index))
+        own_px = _sigma_px(track) * geometry.local_scale(world_from_frame, centre)
+        sigma_px = hypot(camera_sigma_px, own_px)
+        place = WorldPlace(quad, position, velocity, sigma_px, ground, path, frame.index)
+        return replace(track, world=place)
 
     def _on_ground(
         self, position: Doubles, times: Doubles, positions: Doubles
@@ -166,6 +178,23 @@ class WorldMotion:
             return None
         velocity = mean_velocity(times, self._ground.positions(positions))
         return GroundPlace(here, None if velocity is None else float(np.hypot(*velocity)))
+
+
+def _sigma_px(track: Track) -> float:
+    """Expected RMS error of a target's corners in the frame; 0 of one without point pairs."""
+    pairs, pose, quad = track.evidence, track.frame_from_template, track.quad
+    if track.model is None or pose is None or quad is None or not pairs.inliers:
+        return 0.0
+    seen = pairs.is_inlier
+    sigmas_px = corner_sigmas_px(
+        pose,
+        track.model,
+        pairs.template_points[seen],
+        pairs.frame_points[seen],
+        geometry.transform_points(geometry.inverted(pose), quad),
+        _LEAST_POINT_SIGMA_PX,
+    )
+    return float(np.sqrt(np.mean(sigmas_px**2)))
 
 
 def crossing(quad: Points) -> Doubles:

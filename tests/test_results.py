@@ -28,7 +28,8 @@ from streamtrack.types import (
     TrackState,
 )
 
-WORLD = [f"world_{axis}{corner}" for corner in "1234" for axis in "xy"] + ["speed_px_s"]
+WORLD = [f"world_{axis}{corner}" for corner in "1234" for axis in "xy"]
+WORLD += ["speed_px_s", "world_sigma_px"]
 HEADER = ",".join(
     ["frame,time_s,target,state,x1,y1,x2,y2,x3,y3,x4,y4,model,matches,inliers,rmse_px", *WORLD]
 )
@@ -70,9 +71,9 @@ def test_csv_holds_one_row_a_target_a_frame(tmp_path: Path) -> None:
     assert path.read_text().splitlines() == [
         HEADER,
         "0,0.000000,board,tracking,1.062,2.000,11.062,2.000,11.062,22.000,1.062,22.000,"
-        "affine,3,2,0.2500,,,,,,,,,",
-        "0,0.000000,car,lost,,,,,,,,,,0,0,,,,,,,,,,",
-        "7,0.233333,board,lost,,,,,,,,,,0,0,,,,,,,,,,",
+        "affine,3,2,0.2500,,,,,,,,,,",
+        "0,0.000000,car,lost,,,,,,,,,,0,0,,,,,,,,,,,",
+        "7,0.233333,board,lost,,,,,,,,,,0,0,,,,,,,,,,,",
     ]
 
 

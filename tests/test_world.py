@@ -14,12 +14,23 @@ from conftest import FrameList, MakeHomography, MakePicture
 from streamtrack import geometry
 from streamtrack.camera.keyframes import KeyframeGraph
 from streamtrack.errors import UsageError
+from streamtrack.fitting import fit
 from streamtrack.ground import Ground, fit_ground, make_ground, parse_ground
 from streamtrack.pipeline import track
 from streamtrack.results import GROUND_COLUMNS, TRACK_COLUMNS, open_tracks_writer
 from streamtrack.settings import build_settings
 from streamtrack.targets import Target
-from streamtrack.types import CameraPose, Frame, Image, Matrix, Step, Track, TrackState
+from streamtrack.types import (
+    CameraPose,
+    Evidence,
+    Frame,
+    Image,
+    Matrix,
+    Model,
+    Step,
+    Track,
+    TrackState,
+)
 from streamtrack.world import WorldMotion, crossing
 
 IMAGE = np.zeros((8, 8, 3), np.uint8)
@@ -232,8 +243,31 @@ def test_tables_hold_the_ground_after_the_world(tmp_path: Path) -> None:
     with open_tracks_writer(path, TRACK_COLUMNS + GROUND_COLUMNS) as writer:
         writer.write(Step(frame(4), (track_there,), CameraPose(np.eye(3)), None, {"total": 1.0}))
     header, row = (line.split(",") for line in path.read_text().splitlines())
-    assert header[-4:] == ["speed_px_s", "ground_x", "ground_y", "speed_units_s"]
-    assert row[-4:] == ["250.000", "4.0000", "0.5000", "25.0000"]
+    assert header[-5:] == ["speed_px_s", "world_sigma_px", *GROUND_COLUMNS]
+    assert row[-5:] == ["250.000", "0.000", "4.0000", "0.5000", "25.0000"]
+
+
+def test_what_a_world_position_is_worth(rng: np.random.Generator) -> None:
+    """The camera's drift and the target's own noise add up, at the scale of the world."""
+    x, y = np.meshgrid(np.linspace(0, 39, 6), np.linspace(0, 29, 5))
+    there = np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32)
+    pose, box = geometry.translation(50, 50), geometry.box_quad(0, 0, 39, 29)
+    errors, expected = [], []
+    for n in range(200):
+        pairs = there + np.float32(50) + rng.normal(0, 0.5, there.shape).astype(np.float32)
+        found = fit(Model.AFFINE, there, pairs)
+        quad = geometry.transform_points(found, box)
+        evidence = Evidence(there, pairs, np.ones(len(there), np.bool_))
+        one = Track("a", TrackState.TRACKING, quad, found, Model.AFFINE, evidence)
+        camera = CameraPose(geometry.scaling(2.0, 2.0), sigma_px=3.0)
+        world = placed_all(WorldMotion(), n, (one,), camera)[0].world
+        assert world is not None
+        off = world.quad - 2 * geometry.transform_points(pose, box)
+        errors.append(np.mean(np.sum(off**2, axis=1)) + 3.0**2)
+        expected.append(world.sigma_px**2)
+    assert np.sqrt(np.mean(expected)) == pytest.approx(np.sqrt(np.mean(errors)), rel=0.1)
+    unknown = placed_all(WorldMotion(), 0, (one,), CameraPose(geometry.scaling(2.0, 2.0)))[0]
+    assert unknown.world is not None and np.isnan(unknown.world.sigma_px)
 
 
 def test_a_run_puts_targets_into_the_world(make_picture: MakePicture) -> None:

@@ -29,7 +29,7 @@ from streamtrack.mosaic.types import Link
 from streamtrack.types import Matches, Matrix, Model, Registration, Size
 
 _MIN_LINK_OVERLAP = 0.25
-_MAX_NEIGHBOURS = 1  # taken shortly before, beside the one that the keyframe was measured against
+_MAX_NEIGHBOURS = 2  # taken shortly before, beside the one that the keyframe was measured against
 _MAX_LOOPS = 2
 _RECENT = 8  # keyframes taken shortly before are neighbours, others are loops
 _WINDOW = 4  # keyframes whose poses a new edge may move at once

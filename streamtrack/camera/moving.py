@@ -35,6 +35,8 @@ from streamtrack.settings import Settings
 from streamtrack.types import CameraPose, Matrix, Model, Points, Size, Track, Verdict
 
 _MIN_OVERLAP = 0.6
+_MIN_FIRST_OVERLAP = 0.75  # of the keyframes that tell how the first one, the world, is tilted
+_FIRST_KEYFRAMES = 8
 _MIN_OVERLAP_UNSHARP = 0.45  # below which a blurred frame, too, becomes a keyframe
 _MIN_SHARPNESS = 0.75
 _MIN_AGREEING_CELLS = 30
@@ -234,7 +236,9 @@ class MovingCamera:
 
     def _has_moved_on(self, placed: Placed, sight: Sight) -> bool:
         found = placed.found
-        if found.inliers < _MIN_AGREEING_CELLS or placed.overlap(sight) < _MIN_OVERLAP:
+        is_first = len(self.graph.keyframes) < _FIRST_KEYFRAMES
+        least = _MIN_FIRST_OVERLAP if is_first else _MIN_OVERLAP
+        if found.inliers < _MIN_AGREEING_CELLS or placed.overlap(sight) < least:
             return True
         has_changed = not _is_lasting(found) or found.corner_sigma_px > _MAX_LASTING_SIGMA_PX
         return has_changed and sight.index >= placed.keyframe + _MIN_SPACING

@@ -54,6 +54,8 @@ _SHORT_PX = 0.5  # of the usual level: a step that needs no coarser level before
 _SHORT_END = 0.2  # and how much shorter the last step must be
 _SEARCH_SHARE = 0.3  # of the view: how far the search for a shift reaches
 
+_LONGEST_ROW = 32_000
+
 _SIMILARITY, _AFFINE = MODEL_BASES[Model.SIMILARITY], MODEL_BASES[Model.AFFINE]
 _FREEDOMS = (np.eye(8), np.eye(8), _AFFINE, _SIMILARITY, _SIMILARITY)  # by level
 
@@ -320,8 +322,8 @@ def _open(view: ViewLevels, level: int, hidden: Sequence[Points]) -> Image:
 def _in_view(pixels: Pixels, mapping: Matrix, told: Image) -> Pixels:
     """Those of the pixels that ``mapping`` takes to where a level of a view is 1 (h, w)."""
     x, y, depth = _projected(mapping, pixels.points)
-    is_told = cv2.remap(told, x[None], y[None], cv2.INTER_NEAREST, borderValue=0)
-    rows = np.flatnonzero((depth > 0) & (np.asarray(is_told)[0] > 0))
+    is_told = _remapped(told, x, y, cv2.BORDER_CONSTANT, cv2.INTER_NEAREST)
+    rows = np.flatnonzero((depth > 0) & (is_told > 0))
     return pixels if len(rows) == len(x) else pixels.of(rows)
 
 
@@ -338,9 +340,15 @@ def _sampled(values: Floats, mapping: Matrix, points: Floats) -> Floats:
     return _remapped(values, x, y, cv2.BORDER_REPLICATE)
 
 
-def _remapped(values: Floats, x: Floats, y: Floats, border: int) -> Floats:
-    sampled = cv2.remap(values, x[None], y[None], cv2.INTER_LINEAR, borderMode=border)
-    return np.asarray(sampled, np.float32).reshape(-1)
+def _remapped(
+    values: Floats | Image, x: Floats, y: Floats, border: int, flag: int = cv2.INTER_LINEAR
+) -> Floats:
+    """Values (N,) at places (N,), in parts no longer than OpenCV takes a row."""
+    parts = [
+        cv2.remap(values, x[None, at], y[None, at], flag, borderMode=border)[0]
+        for at in (slice(i, i + _LONGEST_ROW) for i in range(0, max(len(x), 1), _LONGEST_ROW))
+    ]
+    return np.asarray(parts[0] if len(parts) == 1 else np.concatenate(parts), np.float32)
 
 
 def _residuals(wanted: Floats, seen: Floats) -> tuple[Floats, Floats]:

@@ -22,7 +22,7 @@ _LONGEST_PX = (1024, 512)  # side of these two levels
 _COARSEST_PX = 40
 _MAX_LEVELS = 5
 _CELLS = (12, 9)
-_CELL_PIXELS = (180, 44, 20, 12, 8)  # chosen of each cell, by level
+_CELL_PIXELS = (500, 44, 20, 12, 8)  # chosen of each cell, by level
 _HIGH_PASS_PX = 25
 EDGE_PX = (9, 3, 3, 3, 3)
 """Left out at the edges, by level: local means reach over them, and keyframes' links feel that."""

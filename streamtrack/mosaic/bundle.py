@@ -25,6 +25,9 @@ from streamtrack.uncertainty import MODEL_BASES, motion_rows
 _MAX_ROUNDS = 30
 _CONVERGED_PX = 5e-3
 MIN_NOISE_PX = 0.05
+_MIN_WEIGHED_PX = 0.15
+"""Least noise of pairs by which they are weighed against the prior: those that lie on their link's
+own mapping show none, but share its error."""
 _MIN_TOLERANCE_PX = 1.0  # links are never wrong for less than three times this
 _HUBER = 1.345  # times the noise: 95 % efficient for Gaussian errors
 _MIN_EXPOSURES = 0.25  # of the links
@@ -215,7 +218,7 @@ def _weights(problem: Problem, errors: Doubles, rejection: _Rejection) -> Double
         huber = np.nan_to_num(np.minimum(1.0, 2 * _HUBER * noise_px / alone))
     of_link = rejection.weights(errors)
     both = np.concatenate([of_link, of_link])[:, None]
-    weights: Doubles = huber * problem.counts * both / noise_px**2
+    weights: Doubles = huber * problem.counts * both / max(noise_px, _MIN_WEIGHED_PX) ** 2
     return weights
 
 

@@ -28,7 +28,7 @@ _MAX_FOCAL_STEP = 0.1
 _FIRST_SIGMAS = np.array([1e-3, 5e-2])  # of stretch and of perspective
 _LEAST_SIGMA = 3e-5
 _MAX_LEAST_STRETCH = 1e-3
-_TILT_SHARE = 4.0  # stretch that is not held against tilted poses, times half of what tilt tells
+_TILT_SHARE = 0.5  # of the stretch that tilt tells, if the camera should not be like that
 _STEP = 1e-6
 
 

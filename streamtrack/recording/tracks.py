@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import rerun as rr
 
 from streamtrack.recording.entities import TRACKS
-from streamtrack.types import Step, Track, TrackState
+from streamtrack.types import Step, Track, TrackState, WorldPlace
 
 _EVERY_S = 0.5
 _CHANGED_EVERY_S = 0.2
@@ -71,7 +71,7 @@ class TracksTable:
         cells = [
             track.name,
             str(track.state),
-            "-" if world is None else "{:.0f}, {:.0f}".format(*world.position),
+            "-" if world is None else _place(world),
             "-" if world is None else _number(world.speed_px_s),
         ]
         if self._has_ground:
@@ -80,6 +80,13 @@ class TracksTable:
                 "-" if ground is None else _number(ground.speed_units_s),
             ]
         return [*cells, str(self._seen[track.name]), track.reason]
+
+
+def _place(world: WorldPlace) -> str:
+    """Its position, and how far off the corners are expected to be."""
+    x, y = world.position
+    spread = f" ± {world.sigma_px:.2g}" if math.isfinite(world.sigma_px) else ""
+    return f"{x:.0f}, {y:.0f}{spread}"
 
 
 def _number(value: float | None) -> str:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from streamtrack import geometry
 from streamtrack.auto.background import Outstanding
 from streamtrack.auto.boxes import HasBox, box_around, moved_point
+from streamtrack.auto.motion import Motion
 from streamtrack.types import Image, Mask, Matrix
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
@@ -21,7 +22,6 @@ Doubles: TypeAlias = npt.NDArray[np.float64]
 _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 _LEAST_PIXELS = 14  # of the grid
 _LEAST_CLEAR = 6
-_ALL_KNOWN_SHARE = 0.98
 _CLOSING_PX = 3
 _SHADE_CLOSING_PX = 9
 _MOST_BLOBS = 80
@@ -57,12 +57,14 @@ class Scene:
     """What moves in one frame: the blobs, the pixels (h, w) they consist of, and the motion there.
 
     ``motion`` (h, w, 2) are grid pixels since the frame before, None if that is not known;
+    ``moves`` (h, w) is where pixels surely move;
     ``image`` (h, w, 3) is the frame in the grid.
     """
 
     blobs: tuple[Blob, ...]
     solid: Mask
     motion: npt.NDArray[np.float32] | None
+    moves: Mask
     image: Image
     grid_from_frame: Doubles
 
@@ -76,34 +78,15 @@ class _Look:
     frame_from_grid: Matrix
 
 
-class MotionField:
-    """Motion against the background, by DIS flow (Kroeger et al. 2016) in the background's grid."""
-
-    def __init__(self) -> None:
-        self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
-        self._flow.setFinestScale(1)
-
-    def measure(self, outstanding: Outstanding) -> npt.NDArray[np.float32] | None:
-        """(h, w, 2) grid pixels since the frame before; None without anything to measure."""
-        before = outstanding.grey_before
-        if before is None or min(before.shape) < 24:
-            return None
-        if outstanding.known.mean() > _ALL_KNOWN_SHARE and not outstanding.clear.any():
-            return None
-        backward = np.zeros((*before.shape, 2), np.float32)
-        self._flow.calc(outstanding.grey, before, backward)
-        return -backward
-
-
-def find_blobs(
-    outstanding: Outstanding, hidden: Mask, motion: npt.NDArray[np.float32] | None
-) -> Scene:
+def find_blobs(outstanding: Outstanding, hidden: Mask, motion: Motion) -> Scene:
     """The things that stand out outside ``hidden`` (h, w), the largest first."""
     clear = outstanding.clear & ~hidden
     solid = np.zeros(clear.shape, np.bool_)
     blobs: list[Blob] = []
+    flow = motion.flow
     if clear.any():
         joined = _joined(clear, outstanding.faint & ~hidden, outstanding.shade)
+        joined[motion.rests] = 0
         count, parts, stats, _ = cv2.connectedComponentsWithStats(joined, connectivity=4)
         clear_counts = np.bincount(parts[clear], minlength=count)
         areas = stats[:, cv2.CC_STAT_AREA]
@@ -111,17 +94,19 @@ def find_blobs(
         is_kept[0] = False
         kept = np.flatnonzero(is_kept)
         look = _Look(
-            color_bins(outstanding.image), motion, geometry.inverted(outstanding.grid_from_frame)
+            color_bins(outstanding.image), flow, geometry.inverted(outstanding.grid_from_frame)
         )
         for part in kept[np.argsort(-areas[kept])][:_MOST_BLOBS]:
             x, y, width, height = stats[part, :4].tolist()
             window = slice(y, y + height), slice(x, x + width)
             inside = parts[window] == part
-            for piece in [inside] if motion is None else _split(inside, motion[window]):
+            for piece in [inside] if flow is None else _split(inside, flow[window]):
                 solid[window] |= piece
                 blobs.append(_blob(piece, window, look))
     blobs = _with_fragments(blobs, frame_px(outstanding))
-    return Scene(tuple(blobs), solid, motion, outstanding.image, outstanding.grid_from_frame)
+    return Scene(
+        tuple(blobs), solid, flow, motion.moves, outstanding.image, outstanding.grid_from_frame
+    )
 
 
 def _with_fragments(blobs: list[Blob], grid_px: float) -> list[Blob]:

@@ -20,12 +20,10 @@ from streamtrack.types import Image, Mask, Matrix, Size, Track
 Doubles: TypeAlias = npt.NDArray[np.float64]
 
 _WIDTH_PX = 320
-REST_PX = 0.4  # grid pixels a frame, below which something stands
 _CELL_PX = 8
 _CORNER = 2e-4  # least eigenvalue of the structure tensor by `cv2.cornerMinEigenVal`
 _LEAST_CORNERS = 12
 _STANDS_PX = 0.5  # grid pixels a frame
-_CHANGE_FACTOR = 4.0  # of the noise, by which a pixel differs from the frame before
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,24 +57,6 @@ def is_invertible(matrix: Matrix) -> bool:
         return bool(np.isfinite(geometry.inverted(matrix)).all())
     except np.linalg.LinAlgError:
         return False
-
-
-def moving_pixels(seen: Outstanding, motion: npt.NDArray[np.float32] | None) -> tuple[Mask, Mask]:
-    """Which pixels (h, w) of the grid are not at rest against the background."""
-    before = seen.grey_before
-    if motion is None or before is None:
-        nothing = np.zeros(seen.clear.shape, np.bool_)
-        return nothing, nothing
-    x, y = cv2.split(motion)
-    flows = np.asarray(cv2.magnitude(x, y) > REST_PX, np.bool_)
-    change = cv2.absdiff(seen.grey, before)
-    change[~seen.comparable] = 0
-    limit = _CHANGE_FACTOR * max(1.0, 1.4826 * float(np.median(change[::3, ::3])))
-    changed = cv2.medianBlur((change > limit).astype(np.uint8), 3)
-    flows &= seen.comparable
-    around = cv2.dilate(changed, np.ones((9, 9), np.uint8)) > 0
-    within = cv2.morphologyEx(changed, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)) > 0
-    return flows & around, flows & within
 
 
 def resting_share(

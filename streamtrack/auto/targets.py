@@ -17,7 +17,7 @@ import numpy.typing as npt
 from streamtrack import geometry
 from streamtrack.auto.association import associate, found_again
 from streamtrack.auto.background import BackgroundModel, Outstanding
-from streamtrack.auto.blobs import Blob, MotionField, Scene, find_blobs, frame_px
+from streamtrack.auto.blobs import Blob, Scene, find_blobs, frame_px
 from streamtrack.auto.boxes import overlap, touched_edges, turning
 from streamtrack.auto.contact import (
     align_all,
@@ -32,12 +32,11 @@ from streamtrack.auto.contact import (
     sight,
 )
 from streamtrack.auto.followed import Followed, Life, predict_all
+from streamtrack.auto.motion import REST_PX, MotionField
 from streamtrack.auto.places import (
-    REST_PX,
     Moment,
     hidden_by,
     is_invertible,
-    moving_pixels,
     reduced,
     resting_share,
 )
@@ -127,15 +126,14 @@ class AutoTargets:
             return self._broken_off(world_from_small, small, small_from_frame, pose.overlay)
         self._broken = 0
         motion = self._field.measure(seen)
-        moving, changing = moving_pixels(seen, motion)
-        seen = self._background.with_young(seen, changing)
+        seen = self._background.with_moving(seen, motion.moves, motion.rests)
         scene = find_blobs(seen, hidden_by(seen, given), motion)
         self.blobs = scene.blobs
         is_fixed = np.array_equal(world_from_frame, np.eye(3))
         moment = Moment(step_s, frame_px(seen), view.size_wh, is_fixed)
         align_all(self._things, view.pyramid, turn, moment)
         self._associate(scene, view.pyramid, moment)
-        self._background.learn(seen, moving, self._protected(seen))
+        self._background.learn(seen, motion.near, self._protected(seen))
         self._confirm(self._background, seen, scene, moment)
         end_duplicates(self._things, moment)
         self._end_left_places(self._background, scene, moment)
@@ -168,7 +166,7 @@ class AutoTargets:
     def _associate(self, scene: Scene, pyramid: Pyramid, moment: Moment) -> None:
         note_contacts(self._things, moment)
         met = [t for t in self._things if t.touches and sight(t, scene, moment)]
-        found = associate(self._things, scene.blobs, _REACH_PX * moment.grid_px)
+        found = associate(self._things, scene, _REACH_PX * moment.grid_px, moment.step_s)
         pairs = list(found.pairs)
         for things, blob in found.shared:
             own = own_things(things, moment)

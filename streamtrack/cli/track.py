@@ -109,7 +109,7 @@ def track(
         Path | None, typer.Option(help="CSV of the camera's poses, each with the error to expect.")
     ] = None,
     video: Annotated[
-        Path | None, typer.Option(help="Annotated copy: .mp4, .mkv, .webm, .avi.")
+        Path | None, typer.Option(help="Annotated copy, without sound: .mp4, .mkv, .webm, .avi.")
     ] = None,
     mosaic: Annotated[
         Path | None,
@@ -118,8 +118,8 @@ def track(
     stabilize: Annotated[
         Path | None,
         typer.Option(
-            help="The video held still: .mp4, .mkv, .webm, .avi. Every frame is shown at its "
-            "time; those without a known pose are counted."
+            help="The video held still, without its sound: .mp4, .mkv, .webm, .avi. Every frame "
+            "is shown at its time; those without a known pose are counted."
         ),
     ] = None,
     stabilize_path: Annotated[

@@ -583,12 +583,12 @@ def test_wrong_usage_is_refused_before_anything_is_written(
     assert not list(tmp_path.iterdir())
 
 
-def test_an_output_that_cannot_be_written_spoils_no_other(tmp_path: Path) -> None:
+def test_a_picture_that_cannot_be_written_is_told_before_the_first_frame(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     outputs = MosaicOutputs(tmp_path / "file" / "m.png", tmp_path / "poses.csv")
-    outcome = run(job(tmp_path, outputs=outputs))
-    assert "file stands where its folder should be" in str(outcome.error)
-    assert len(poses_of(tmp_path)) == 14
+    with pytest.raises(OutputError, match="file stands where its folder should be"):
+        run(job(tmp_path, outputs=outputs))
+    assert not (tmp_path / "poses.csv").exists()
 
 
 def test_a_camera_that_is_not_there_is_waited_for_until_the_wish_to_stop(tmp_path: Path) -> None:

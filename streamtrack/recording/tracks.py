@@ -12,7 +12,7 @@ from streamtrack.recording.entities import TRACKS
 from streamtrack.types import Step, Track, TrackState, WorldPlace
 
 _EVERY_S = 0.5
-_CHANGED_EVERY_S = 0.2
+_CHANGED_EVERY_S = 0.05
 _MOST_ROWS = 40
 
 

@@ -162,3 +162,12 @@ def test_a_view_half_of_which_moved_is_a_similarity_only_if_that_explains_it_as_
     truth = geometry.inverted(first) @ second
     off = geometry.transform_points(found.reference_from_view, still)
     assert np.abs(off - geometry.transform_points(truth, still)).max() < most_px
+
+
+def test_texture_as_strong_everywhere_is_more_than_opencv_takes_at_once() -> None:
+    """All pixels of a chessboard's edges are as strong as the last that is chosen."""
+    y, x = np.mgrid[0:768, 0:1024]
+    board = ViewLevels((((x // 8 + y // 8) % 2) * 100 + 60).astype(np.uint8))
+    found = align_exactly(ReferenceView(board), board, np.eye(3))
+    assert found.reference_from_view is not None
+    assert corner_error(found.reference_from_view, np.eye(3), board.size_wh) < 1e-3

@@ -21,7 +21,6 @@ from streamtrack.auto.background import BackgroundModel
 from streamtrack.auto.blobs import Scene
 from streamtrack.auto.boxes import overlap
 from streamtrack.auto.motion import MotionField
-from streamtrack.auto.parting import Parting, gap_between
 from streamtrack.auto.places import motion_within, reduced
 from streamtrack.errors import UsageError
 from streamtrack.features import FeatureExtractor
@@ -33,7 +32,7 @@ from streamtrack.pyramid import Pyramid
 from streamtrack.settings import Settings
 from streamtrack.sources import open_source
 from streamtrack.targets import Target, given_targets, parse_targets
-from streamtrack.types import CameraPose, Frame, Image, Mask, Track, TrackState
+from streamtrack.types import CameraPose, Frame, Image, Track, TrackState
 from streamtrack.watching import Outputs
 
 SIZE = (320, 240)
@@ -475,69 +474,10 @@ def test_boxes_overlap() -> None:
 def test_no_motion_is_read_beside_the_picture(side: float) -> None:
     solid = np.ones((SIZE[1], SIZE[0]), np.bool_)
     motion = np.ones((SIZE[1], SIZE[0], 2), np.float32)
-    scene = Scene((), solid, motion, solid, np.zeros((SIZE[1], SIZE[0], 3), np.uint8), np.eye(3))
+    scene = Scene((), solid, motion, np.zeros((SIZE[1], SIZE[0], 3), np.uint8), np.eye(3))
     box = np.array([side, 100.0, side + 40, 140.0])
     assert motion_within(scene, box) is None
     assert motion_within(scene, np.array([100.0, 100.0, 140.0, 140.0])) is not None
-
-
-def test_anchors_are_aligned_to_a_part_of_a_pixel() -> None:
-    world = World()
-    thing = texture(20, (80, 40), 150, 250)
-    box = np.array([99.5, 79.5, 179.5, 119.5])
-    solid = np.ones((SIZE[1], SIZE[0]), np.bool_)
-    pictures = []
-    for x in (100.0, 102.3):
-        picture = world.ground[:, : SIZE[0]].copy()
-        moved = np.array([[1, 0, x], [0, 1, 80.0]])
-        cv2.warpAffine(thing, moved, SIZE, picture, borderMode=cv2.BORDER_TRANSPARENT)
-        pictures.append(picture)
-    scene = Scene((), solid, None, solid, pictures[0], np.eye(3))
-    first, second = (Pyramid(cv2.cvtColor(p, cv2.COLOR_BGR2GRAY)) for p in pictures)
-    anchor = Anchor.taken(first, box, scene)
-    assert anchor is not None
-    middle = np.array([complex(139.5, 99.5)])
-    found = align(second, [anchor], middle, np.ones(1, np.complex128))
-    assert found.is_near[0] and found.correlations[0] > 0.9
-    assert abs(found.centers[0] - (middle[0] + 2.3)) < 0.1
-    blank = Pyramid(np.full((SIZE[1], SIZE[0]), 128, np.uint8))
-    assert align(blank, [anchor], middle, np.ones(1, np.complex128)).correlations[0] < 0.5
-
-
-def _scene(moves: Mask) -> Scene:
-    picture = np.zeros((*moves.shape, 3), np.uint8)
-    return Scene((), moves, None, moves, picture, np.eye(3))
-
-
-@pytest.mark.parametrize(
-    ("gap_step", "is_moving", "is_two"),
-    [(3.0, False, True), (0.0, False, False), (3.0, True, False)],
-    ids=["goes along", "stands, as a post does", "its pixels move"],
-)
-def test_a_thing_is_two_if_its_gap_goes_along(
-    gap_step: float, is_moving: bool, is_two: bool
-) -> None:
-    scene = _scene(np.full((SIZE[1], SIZE[0]), is_moving))
-    parting = Parting()
-    verdicts = []
-    for index in range(12):
-        gap = np.array([60.0, 40.0, 66.0, 60.0]) + gap_step * index * np.array([1, 0, 1, 0])
-        center = np.array([63.0 + 3 * index, 50.0])
-        verdicts.append(parting.note_gap(gap, center, np.array([3.0, 0.0]), scene))
-    assert any(verdicts) is is_two
-    assert not any(verdicts[:4])  # one frame proves nothing
-
-
-def test_the_gap_between_boxes() -> None:
-    one, beside, corner = ([0, 0, 10, 10], [14, 2, 20, 12], [14, 30, 20, 40])
-    boxes = [np.array(box, np.float64) for box in (one, beside, corner)]
-    gap = gap_between(boxes[0], boxes[1])
-    assert gap is not None
-    np.testing.assert_allclose(gap, [10, 2, 14, 10])
-    gap = gap_between(boxes[0], boxes[2])
-    assert gap is not None
-    np.testing.assert_allclose(gap, [0, 10, 20, 30])
-    assert gap_between(boxes[0], boxes[0]) is None
 
 
 def test_the_ground_between_two_that_drive_side_by_side_rests_and_they_move() -> None:
@@ -553,21 +493,32 @@ def test_the_ground_between_two_that_drive_side_by_side_rests_and_they_move() ->
             background = BackgroundModel((small.shape[1], small.shape[0]), np.eye(3))
         seen = background.compare(small, np.eye(3), small_from_frame, ())
         motion = field.measure(seen)
-        background.learn(seen, motion.near, np.zeros(seen.clear.shape, np.bool_))
+        background.learn(seen, motion.moving, np.zeros(seen.clear.shape, np.bool_))
     x0, y0, x1, y1 = (truth[-1]["near"] + 0.5).astype(int)
-    assert motion.moves[y0 + 2 : y1 - 2, x0 + 2 : x1 - 2].mean() > 0.9
+    assert motion.changing[y0 + 2 : y1 - 2, x0 + 2 : x1 - 2].mean() > 0.9
     gap = slice(y1 + 3, y1 + 7), slice(x0 + 4, x1 - 4)
     assert motion.rests[gap].mean() > 0.7
-    assert motion.moves[gap].mean() < 0.1
+    assert motion.changing[gap].mean() < 0.1
 
 
-def test_two_that_drive_side_by_side_from_the_start_are_two() -> None:
-    def path(index: int) -> dict[str, tuple[float, float]]:
-        return {"near": (20 + 3.0 * index, 90), "far": (26 + 3.0 * index, 119)}
-
-    frames, truth = played(path, 40, {"near": (50, 24), "far": (50, 24)})
-    steps = follow(frames)
-    near, far = (names_on(steps, truth, thing) for thing in ("near", "far"))
-    assert None not in near[10:] and None not in far[10:]
-    assert near[10] != far[10]
-    assert len(set(near[10:])) == len(set(far[10:])) == 1
+def test_anchors_are_aligned_to_a_part_of_a_pixel() -> None:
+    world = World()
+    thing = texture(20, (80, 40), 150, 250)
+    box = np.array([99.5, 79.5, 179.5, 119.5])
+    solid = np.ones((SIZE[1], SIZE[0]), np.bool_)
+    pictures = []
+    for x in (100.0, 102.3):
+        picture = world.ground[:, : SIZE[0]].copy()
+        moved = np.array([[1, 0, x], [0, 1, 80.0]])
+        cv2.warpAffine(thing, moved, SIZE, picture, borderMode=cv2.BORDER_TRANSPARENT)
+        pictures.append(picture)
+    scene = Scene((), solid, None, pictures[0], np.eye(3))
+    first, second = (Pyramid(cv2.cvtColor(p, cv2.COLOR_BGR2GRAY)) for p in pictures)
+    anchor = Anchor.taken(first, box, scene)
+    assert anchor is not None
+    middle = np.array([complex(139.5, 99.5)])
+    found = align(second, [anchor], middle, np.ones(1, np.complex128))
+    assert found.is_near[0] and found.correlations[0] > 0.9
+    assert abs(found.centers[0] - (middle[0] + 2.3)) < 0.1
+    blank = Pyramid(np.full((SIZE[1], SIZE[0]), 128, np.uint8))
+    assert align(blank, [anchor], middle, np.ones(1, np.complex128)).correlations[0] < 0.5

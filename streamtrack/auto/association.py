@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack.auto.assignment import assign
-from streamtrack.auto.blobs import Blob, Scene, united_blob
+from streamtrack.auto.blobs import Blob, united_blob
 from streamtrack.auto.boxes import overlap, overlaps
 from streamtrack.auto.followed import Followed, Life
 
@@ -39,11 +39,9 @@ class Associated:
     free: tuple[Blob, ...]
 
 
-def associate(
-    things: Sequence[Followed], scene: Scene, reach_px: float, step_s: float
-) -> Associated:
+def associate(things: Sequence[Followed], blobs: Sequence[Blob], reach_px: float) -> Associated:
     """Pair things, already predicted, with blobs; ``reach_px`` is added to every gate."""
-    wholes = _put_together(things, scene, reach_px, step_s)
+    wholes = _put_together(things, blobs, reach_px)
     found = dict(assign(_costs(things, wholes, reach_px)))
     shared = _sharing(things, wholes, found)
     told = {row for rows in shared.values() for row in rows}
@@ -108,11 +106,8 @@ def _costs(things: Sequence[Followed], blobs: Sequence[Blob], reach_px: float) -
     return np.where(is_beyond, np.inf, costs)
 
 
-def _put_together(
-    things: Sequence[Followed], scene: Scene, reach_px: float, step_s: float
-) -> list[Blob]:
+def _put_together(things: Sequence[Followed], blobs: Sequence[Blob], reach_px: float) -> list[Blob]:
     """The blobs, those that are fragments of one thing made one."""
-    blobs = scene.blobs
     if not things or not blobs:
         return list(blobs)
     thing_boxes = np.stack([thing.box for thing in things])
@@ -131,16 +126,14 @@ def _put_together(
         is_other_whole = (np.delete(ious, row, axis=0) > 0.5).any(axis=0)
         parts = np.flatnonzero((inside[row] >= _FRAGMENT_INSIDE) & ~is_other_whole).tolist()
         parts = [part for part in parts if part not in gone]
+        sizes = sorted(areas[parts])
         if len(parts) < 2:
-            things[row].parting.note_whole()
             continue
-        parts.sort(key=lambda part: -float(areas[part]))
-        largest, second = blobs[parts[0]], blobs[parts[1]]
-        if areas[parts[1]] > _FRAGMENT_SHARE * areas[parts[0]]:
-            if things[row].parts_from(largest, second, scene, step_s):
-                continue
-            if not all(_is_in_line(blobs[part], largest, things[row].velocity) for part in parts):
-                continue  # two that are alike in size are two things, if nothing parts them
+        largest = blobs[max(parts, key=lambda part: float(areas[part]))]
+        if sizes[-2] > _FRAGMENT_SHARE * sizes[-1] and not all(
+            _is_in_line(blobs[part], largest, things[row].velocity) for part in parts
+        ):
+            continue  # two that are alike in size are two things, if nothing parts them
         parts = [part for part in parts if not _moves_otherwise(blobs[part], largest, reach_px)]
         if len(parts) < 2:
             continue

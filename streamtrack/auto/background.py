@@ -48,7 +48,6 @@ _RESTLESS_RATE = 0.08  # at which the noise of what flickers or sways in its pla
 _DARKEST_SHADE = 0.45
 _LOG = np.log(np.arange(256, dtype=np.float32) + 6)
 _BOX = np.ones((3, 3), np.uint8)
-_GAP = np.ones((5, 5), np.uint8)  # of what moves, that is closed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +55,6 @@ class Outstanding:
     """What differs from the background in one frame; all arrays in pixels of the model's grid.
 
     clear, faint      bool (h, w), differs clearly; differs at least faintly
-    unlike            bool (h, w), differs at least faintly from the very pixel of the background
     shade             bool (h, w), of those: darker in the same colour, as a shadow is
     image             uint8 (h, w, 3), the frame in the grid
     grey, grey_before uint8 (h, w), this frame and the one before, None if that is not known
@@ -68,7 +66,6 @@ class Outstanding:
 
     clear: Mask
     faint: Mask
-    unlike: Mask
     shade: Mask
     image: Image
     grey: Image
@@ -133,15 +130,13 @@ class BackgroundModel:
         clear = known & (distance > limit)
         limit *= np.float32(_LOW_SHARE)
         faint = known & (distance > limit)
-        unlike = known & (off > limit)
         self._last = (image, off, seen, relit)
         before, self._grey_before = self._grey_before, grey
         comparable, self._seen_before = seen & self._seen_before, seen
         return Outstanding(
             clear,
             faint,
-            unlike,
-            _shaded(unlike, image, background),
+            _shaded(faint, image, background),
             image,
             grey,
             before,
@@ -151,18 +146,14 @@ class BackgroundModel:
             noise,
         )
 
-    def with_moving(self, outstanding: Outstanding, moves: Mask, rests: Mask) -> Outstanding:
-        """What differs, with what moves (h, w), and without what rests (h, w) beside it.
-
-        What moves differs clearly before a background that is not known yet; its inner parts differ
-        at least faintly even if they have the colours of the background around.
-        """
-        marked = moves.astype(np.uint8)
-        closed = cv2.morphologyEx(marked, cv2.MORPH_CLOSE, _GAP) > 0
-        inner = cv2.erode(marked, _BOX) > 0
-        clear = outstanding.clear | (closed & ~rests & ~outstanding.known)
-        faint = outstanding.faint | clear | (inner & outstanding.unlike & ~outstanding.shade)
-        return replace(outstanding, clear=clear, faint=faint)
+    def with_young(self, outstanding: Outstanding, moving: Mask) -> Outstanding:
+        """What differs, with what moves (h, w) before a background that is not known yet."""
+        young = moving & ~outstanding.known
+        if not young.any():
+            return outstanding
+        return replace(
+            outstanding, clear=outstanding.clear | young, faint=outstanding.faint | young
+        )
 
     def learn(self, outstanding: Outstanding, moving: Mask, protected: Mask) -> None:
         """Take in the frame last compared.

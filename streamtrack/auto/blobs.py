@@ -57,14 +57,12 @@ class Scene:
     """What moves in one frame: the blobs, the pixels (h, w) they consist of, and the motion there.
 
     ``motion`` (h, w, 2) are grid pixels since the frame before, None if that is not known;
-    ``moves`` (h, w) is where pixels surely move;
     ``image`` (h, w, 3) is the frame in the grid.
     """
 
     blobs: tuple[Blob, ...]
     solid: Mask
     motion: npt.NDArray[np.float32] | None
-    moves: Mask
     image: Image
     grid_from_frame: Doubles
 
@@ -104,9 +102,7 @@ def find_blobs(outstanding: Outstanding, hidden: Mask, motion: Motion) -> Scene:
                 solid[window] |= piece
                 blobs.append(_blob(piece, window, look))
     blobs = _with_fragments(blobs, frame_px(outstanding))
-    return Scene(
-        tuple(blobs), solid, flow, motion.moves, outstanding.image, outstanding.grid_from_frame
-    )
+    return Scene(tuple(blobs), solid, flow, outstanding.image, outstanding.grid_from_frame)
 
 
 def _with_fragments(blobs: list[Blob], grid_px: float) -> list[Blob]:

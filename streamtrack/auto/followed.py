@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from streamtrack import geometry
 from streamtrack.auto.anchor import Held
-from streamtrack.auto.blobs import Blob, Scene
+from streamtrack.auto.blobs import Blob
 from streamtrack.auto.boxes import (
     HasBox,
     box_around,
@@ -22,7 +22,6 @@ from streamtrack.auto.boxes import (
 )
 from streamtrack.auto.free_ends import FreeEnds, by_both_ends
 from streamtrack.auto.likeness import Likeness
-from streamtrack.auto.parting import Parting, gap_between
 from streamtrack.types import Matrix, Points, Size
 
 Doubles: TypeAlias = npt.NDArray[np.float64]
@@ -73,7 +72,6 @@ class Followed(HasBox):
     lost_s: float = 0.0
     still: int = 0
     ends: FreeEnds = field(default_factory=FreeEnds)
-    parting: Parting = field(default_factory=Parting)
     likeness: Likeness | None = None
     held: Held | None = None
     is_aligned: bool = False
@@ -137,18 +135,6 @@ class Followed(HasBox):
         self.colors = self.colors + _COLOR_RATE * (blob.colors - self.colors)
         self.hits += 1
         self.misses = self.guessed = self.joined = 0
-
-    def parts_from(self, larger: Blob, other: Blob, scene: Scene, step_s: float) -> bool:
-        """Were these two things, taken for one? It is the larger from then on."""
-        gap = gap_between(larger.box, other.box)
-        if gap is None or not self.parting.note_gap(
-            gap, self.center, self.velocity * step_s, scene
-        ):
-            return False
-        self.box, self.hits = larger.box.copy(), min(self.hits, _KNOWN_HITS // 2)
-        self.ends, self.parting = FreeEnds(), Parting()
-        self.held, self.likeness, self.is_aligned, self.alone = None, None, False, 0
-        return True
 
     def resume(self, life: Life) -> None:
         """It was met with again; what has no name yet stays new."""

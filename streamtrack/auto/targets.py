@@ -122,18 +122,19 @@ class AutoTargets:
             self._background = BackgroundModel(size_wh, world_from_small)
         seen = self._background.compare(small, world_from_small, small_from_frame, pose.overlay)
         turn = self._predict(world_from_frame, view.frame.time_s, view.size_wh)
+        self._end_covered(seen, pose.overlay)
         if not seen.is_explained:
             return self._broken_off(world_from_small, small, small_from_frame, pose.overlay)
         self._broken = 0
         motion = self._field.measure(seen)
-        seen = self._background.with_moving(seen, motion.moves, motion.rests)
+        seen = self._background.with_young(seen, motion.changing)
         scene = find_blobs(seen, hidden_by(seen, given), motion)
         self.blobs = scene.blobs
         is_fixed = np.array_equal(world_from_frame, np.eye(3))
         moment = Moment(step_s, frame_px(seen), view.size_wh, is_fixed)
         align_all(self._things, view.pyramid, turn, moment)
         self._associate(scene, view.pyramid, moment)
-        self._background.learn(seen, motion.near, self._protected(seen))
+        self._background.learn(seen, motion.moving, self._protected(seen))
         self._confirm(self._background, seen, scene, moment)
         end_duplicates(self._things, moment)
         self._end_left_places(self._background, scene, moment)
@@ -166,7 +167,7 @@ class AutoTargets:
     def _associate(self, scene: Scene, pyramid: Pyramid, moment: Moment) -> None:
         note_contacts(self._things, moment)
         met = [t for t in self._things if t.touches and sight(t, scene, moment)]
-        found = associate(self._things, scene, _REACH_PX * moment.grid_px, moment.step_s)
+        found = associate(self._things, scene.blobs, _REACH_PX * moment.grid_px)
         pairs = list(found.pairs)
         for things, blob in found.shared:
             own = own_things(things, moment)
@@ -224,6 +225,17 @@ class AutoTargets:
             if thing.still >= _REST_FRAMES and thing.still % _REST_FRAMES == 0:
                 _end_left_place(thing, background, scene)
         self._things = [thing for thing in self._things if thing.life is not Life.OVER]
+
+    def _end_covered(self, seen: Outstanding, overlay: Sequence[Points]) -> None:
+        """End what was taken for a thing and is found to lie over every picture."""
+        if not overlay:
+            return
+        covers = filled(overlay, seen.grid_from_frame, seen.clear.shape)
+        self._things = [
+            thing
+            for thing in self._things
+            if not _is_mostly(filled([thing.quad], seen.grid_from_frame, covers.shape), covers)
+        ]
 
     def _is_claimed(self, blob: Blob) -> bool:
         return any(
@@ -340,6 +352,11 @@ def _end_left_place(thing: Followed, background: BackgroundModel, scene: Scene) 
     background.heal(there)
     thing.life = Life.OVER
     return True
+
+
+def _is_mostly(place: Mask, there: Mask) -> bool:
+    """Does most of a place (h, w) lie there?"""
+    return bool(np.count_nonzero(place & there) > 0.5 * np.count_nonzero(place))
 
 
 def _is_over(thing: Followed, size_wh: Size) -> bool:

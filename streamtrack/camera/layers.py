@@ -77,18 +77,19 @@ def separated(
     view: ViewLevels,
     found: ViewAlignment,
     hidden: Sequence[Points] = (),
-    guess: Matrix | None = None,
+    proposed: Matrix | None = None,
 ) -> Layers:
     """The background's alignment and what moves before it, by one that a part of a view agrees on.
 
-    ``hidden`` are quads (4, 2) in the view that belong to neither. If neither motion explains
-    clearly more of the view than the other, the alignment is refused as uncertain.
+    ``hidden`` are quads (4, 2) in the view that belong to neither, ``proposed`` is another place
+    (``reference_from_view``), taken if the view is much more alike there. If neither motion
+    explains clearly more of the view than the other, the alignment is refused as uncertain.
     """
     assert found.reference_from_view is not None
     compared = _Compared(reference, view)
     one = compared.under(found.reference_from_view)
-    if guess is not None:
-        rival = align_near(reference, view, guess, hidden)
+    if proposed is not None:
+        rival = align_near(reference, view, proposed, hidden)
         if _is_sharper(rival, found):
             return Layers(rival, ())
     rest = one.is_seen & ~one.is_alike

@@ -10,12 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from streamtrack import geometry
-from streamtrack.types import Matrix, Model, Points
+from streamtrack.types import Evidence, Matrix, Model, Points
 
 Doubles = npt.NDArray[np.float64]
 
 _INDEPENDENT_ERRORS = 25.0
 _FEW = 8
+_LEAST_POINT_SIGMA_PX = 0.1  # of a target's points
 _E = np.eye(8)
 MODEL_BASES = {
     Model.TRANSLATION: _E[:, [2, 5]],
@@ -73,3 +74,20 @@ def corner_sigmas_px(
     spreads = np.einsum("cik,kl,cil->c", reach, covariance, reach)
     sigmas: Doubles = np.sqrt(np.maximum(spreads, 0.0))
     return sigmas
+
+
+def target_sigma_px(pose: Matrix, model: Model, evidence: Evidence, quad: Points) -> float:
+    """RMS over the corners ``quad`` (4, 2) of a target of how far off they may be in the frame.
+
+    ``pose`` (frame_from_template) is a fit of ``model`` to the inliers of ``evidence``.
+    """
+    seen = evidence.is_inlier
+    sigmas_px = corner_sigmas_px(
+        pose,
+        model,
+        evidence.template_points[seen],
+        evidence.frame_points[seen],
+        quad,
+        _LEAST_POINT_SIGMA_PX,
+    )
+    return float(np.sqrt(np.mean(sigmas_px**2)))

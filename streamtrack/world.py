@@ -19,7 +19,7 @@ import numpy.typing as npt
 from streamtrack import geometry
 from streamtrack.ground import Ground
 from streamtrack.types import Frame, GroundPlace, Matrix, Points, Step, Track, WorldPlace
-from streamtrack.uncertainty import corner_sigmas_px
+from streamtrack.uncertainty import target_sigma_px
 
 if TYPE_CHECKING:
     from streamtrack.pose_graph import PoseGraph
@@ -31,7 +31,6 @@ _LEAST_IN_WINDOW = 5  # where frames come slowly
 _MOST_WINDOW_S = 2.0
 _MOST_IN_WINDOW = 24
 _MOST_POINTS = 4096
-_LEAST_POINT_SIGMA_PX = 0.1
 
 Doubles = npt.NDArray[np.float64]
 
@@ -182,19 +181,11 @@ class WorldMotion:
 
 def _sigma_px(track: Track) -> float:
     """Expected RMS error of a target's corners in the frame; 0 of one without point pairs."""
-    pairs, pose, quad = track.evidence, track.frame_from_template, track.quad
-    if track.model is None or pose is None or quad is None or not pairs.inliers:
+    pose, quad = track.frame_from_template, track.quad
+    if track.model is None or pose is None or quad is None or not track.evidence.inliers:
         return 0.0
-    seen = pairs.is_inlier
-    sigmas_px = corner_sigmas_px(
-        pose,
-        track.model,
-        pairs.template_points[seen],
-        pairs.frame_points[seen],
-        geometry.transform_points(geometry.inverted(pose), quad),
-        _LEAST_POINT_SIGMA_PX,
-    )
-    return float(np.sqrt(np.mean(sigmas_px**2)))
+    corners = geometry.transform_points(geometry.inverted(pose), quad)
+    return target_sigma_px(pose, track.model, track.evidence, corners)
 
 
 def crossing(quad: Points) -> Doubles:

@@ -6,14 +6,13 @@ import numpy as np
 
 from streamtrack import geometry
 from streamtrack.types import Evidence, Matrix, Model, Points
-from streamtrack.uncertainty import corner_sigmas_px
+from streamtrack.uncertainty import target_sigma_px
 
 MAX_SIGMA_FOLLOWED_PX = 6.0
 """RMS over the corners, of a target that was followed to where it is."""
 MAX_SIGMA_FOUND_PX = 3.0
 """Of one that was found anew."""
 _USUAL_SIZE_PX = 400.0  # larger targets may be less certain in proportion
-_LEAST_POINT_SIGMA_PX = 0.1
 
 
 def are_corners_certain(
@@ -24,15 +23,6 @@ def are_corners_certain(
     What motion lets expect of hidden corners is no evidence here: it is what goes wrong unnoticed.
     ``model`` says by how many freedoms the corners may be off.
     """
-    seen = evidence.is_inlier
-    sigmas_px = corner_sigmas_px(
-        pose,
-        model,
-        evidence.template_points[seen],
-        evidence.frame_points[seen],
-        quad,
-        _LEAST_POINT_SIGMA_PX,
-    )
     area_px = abs(geometry.signed_area(geometry.transform_points(pose, quad)))
     size = max(1.0, float(np.sqrt(area_px)) / _USUAL_SIZE_PX)
-    return float(np.sqrt(np.mean(sigmas_px**2))) <= most_px * size
+    return target_sigma_px(pose, model, evidence, quad) <= most_px * size

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -73,11 +74,7 @@ class Doubts:
 
 
 def separated(
-    reference: ReferenceView,
-    view: ViewLevels,
-    found: ViewAlignment,
-    hidden: Sequence[Points] = (),
-    proposed: Matrix | None = None,
+    compared: Compared, hidden: Sequence[Points] = (), proposed: Matrix | None = None
 ) -> Layers:
     """The background's alignment and what moves before it, by one that a part of a view agrees on.
 
@@ -85,9 +82,8 @@ def separated(
     (``reference_from_view``), taken if the view is much more alike there. If neither motion
     explains clearly more of the view than the other, the alignment is refused as uncertain.
     """
-    assert found.reference_from_view is not None
-    compared = _Compared(reference, view)
-    one = compared.under(found.reference_from_view)
+    reference, view, found = compared.reference, compared.view, compared.found
+    one = compared.under_found
     if proposed is not None:
         rival = align_near(reference, view, proposed, hidden)
         if _is_sharper(rival, found):
@@ -95,7 +91,7 @@ def separated(
     rest = one.is_seen & ~one.is_alike
     if np.count_nonzero(rest) < _LEAST_REST * rest.size:
         return Layers(found, compared.quads(rest))
-    guess = compared.guess_for(rest, one, found.reference_from_view)
+    guess = compared.guess_for(rest)
     apart = ReferenceView(reference.levels, reference.hidden, one.is_alike)
     rival = align(apart, view, guess, hidden)
     is_borne_out = rival.inliers >= _RIVAL_SHARE * len(rival.is_inlier)
@@ -110,17 +106,13 @@ def separated(
     return Layers(background, compared.quads(foreground))
 
 
-def is_contradicted(
-    reference: ReferenceView, view: ViewLevels, found: ViewAlignment, expected: Matrix
-) -> bool:
+def is_contradicted(compared: Compared, expected: Matrix) -> bool:
     """Does the place where a view was expected explain much of it that the one found does not?
 
     Then the one found is rather that of a large thing which has come into view; a camera that
     truly jerked shows nothing more where it would have been.
     """
-    assert found.reference_from_view is not None
-    compared = _Compared(reference, view)
-    here, there = compared.under(found.reference_from_view), compared.under(expected)
+    here, there = compared.under_found, compared.under(expected)
     return _extent(compared.better(there, here)) > _CONTRADICTING
 
 
@@ -153,23 +145,39 @@ class _Under:
     off: Floats
 
 
-class _Compared:
-    """A reference and a view of it, at the level at which frames are followed (h, w)."""
+class Compared:
+    """A reference and a view of it that was ``found`` in it, at the level of following (h, w)."""
 
-    def __init__(self, reference: ReferenceView, view: ViewLevels) -> None:
-        self._wanted = reference.levels.high_passed(USUAL)
-        self._seen = view.high_passed(USUAL)
+    def __init__(self, reference: ReferenceView, view: ViewLevels, found: ViewAlignment) -> None:
+        self.reference, self.view, self.found = reference, view, found
         self._level_from_reference = reference.levels.level_from_view(USUAL)
         self._view_from_level = geometry.inverted(view.level_from_view(USUAL))
-        self._energy = cv2.blur(self._wanted * self._wanted, _WINDOW)
-        self._shown = ~filled(reference.hidden, self._level_from_reference, self._wanted.shape)
+
+    @cached_property
+    def _wanted(self) -> Floats:
+        return self.reference.levels.high_passed(USUAL)
+
+    @cached_property
+    def _energy(self) -> Floats:
+        return np.asarray(cv2.blur(self._wanted * self._wanted, _WINDOW), np.float32)
+
+    @cached_property
+    def _shown(self) -> Mask:
+        return ~filled(self.reference.hidden, self._level_from_reference, self._wanted.shape)
+
+    @cached_property
+    def under_found(self) -> _Under:
+        """The view where it was found."""
+        assert self.found.reference_from_view is not None
+        return self.under(self.found.reference_from_view)
 
     def under(self, reference_from_view: Matrix) -> _Under:
         """The view under a mapping, compared with the reference."""
         height, width = self._wanted.shape
         mapping = self._level_from_reference @ reference_from_view @ self._view_from_level
-        values = cv2.warpPerspective(self._seen, mapping, (width, height))
-        everywhere = np.full(self._seen.shape, 255, np.uint8)
+        seen_values = self.view.high_passed(USUAL)
+        values = cv2.warpPerspective(seen_values, mapping, (width, height))
+        everywhere = np.full(seen_values.shape, 255, np.uint8)
         seen = cv2.warpPerspective(everywhere, mapping, (width, height), flags=cv2.INTER_NEAREST)
         is_seen = np.asarray(self._shown & (cv2.erode(seen, _CLOSED) > 0))
         both = cv2.blur(self._wanted * values, _WINDOW)
@@ -188,13 +196,14 @@ class _Compared:
         worse = other.off > np.float32(_BETTER) * one.off + np.float32(_BETTER_LEVELS)
         return np.asarray(one.is_seen & other.is_seen & worse)
 
-    def guess_for(self, rest: Mask, under: _Under, reference_from_view: Matrix) -> Matrix:
-        """A mapping under which the rest (h, w), unlike under the given one, agrees better."""
+    def guess_for(self, rest: Mask) -> Matrix:
+        """A mapping under which the rest (h, w), unlike where the view was found, agrees better."""
+        assert self.found.reference_from_view is not None
         share = np.asarray(cv2.blur(rest.astype(np.float32), _WINDOW), np.float32)
-        shift, _ = cv2.phaseCorrelate(under.values * share, self._wanted * share)
+        shift, _ = cv2.phaseCorrelate(self.under_found.values * share, self._wanted * share)
         level = self._level_from_reference
         moved = geometry.inverted(level) @ geometry.translation(*shift) @ level
-        return geometry.normalized(moved @ reference_from_view)
+        return geometry.normalized(moved @ self.found.reference_from_view)
 
     def quads(self, places: Mask) -> tuple[Points, ...]:
         """Boxes, in pixels of the reference, around the larger connected places (h, w)."""

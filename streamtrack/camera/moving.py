@@ -20,7 +20,7 @@ from streamtrack import geometry
 from streamtrack.camera.following import PointMotion, followed, is_majority, is_surprising
 from streamtrack.camera.keyframe_links import LevelCache, NewKeyframe, link_of, overlapping
 from streamtrack.camera.keyframes import KeyframeGraph
-from streamtrack.camera.layers import Doubts, is_contradicted, separated
+from streamtrack.camera.layers import Compared, Doubts, is_contradicted, separated
 from streamtrack.camera.loops import LoopCloser
 from streamtrack.camera.picture_overlay import OverlayWatch
 from streamtrack.camera.placed import Placed, Sight, State
@@ -159,17 +159,17 @@ class MovingCamera:
         """
         keyframe, found, state = placed.keyframe, placed.found, self._state
         assert state is not None
-        reference, levels = self._reference(keyframe), sight.levels
+        compared = Compared(self._reference(keyframe), sight.levels, found)
         is_followed = keyframe == state.keyframe
         if is_followed and is_surprising(found, state, sight):
             expected = state.predicted(sight.time_s)
             is_vague = state.is_old(sight.time_s) and not is_majority(found)
-            if is_vague or is_contradicted(reference, levels, found, expected):
+            if is_vague or is_contradicted(compared, expected):
                 return Placed(keyframe, found.refused(Verdict.UNCERTAIN))
         if not self._doubts.are_due(keyframe, found):
             return placed
         guess = points.guess if is_followed else None
-        layers = separated(reference, levels, found, sight.hidden, guess)
+        layers = separated(compared, sight.hidden, guess)
         self._hide(keyframe, layers.foreground)
         return Placed(keyframe, layers.background)
 
@@ -306,7 +306,7 @@ class MovingCamera:
             return reference
         here_from_before = geometry.inverted(placed.pose) @ before.keyframe_from_frame
         ours = replace(placed.found, reference_from_view=here_from_before)
-        layers = separated(reference, before.sight.levels, ours, hidden)
+        layers = separated(Compared(reference, before.sight.levels, ours), hidden)
         if layers.background.reference_from_view is None:
             return None
         if layers.background is not ours or not layers.foreground:

@@ -95,7 +95,7 @@ class State:
     """Where the camera was last known to be.
 
     ``sight`` is what it saw there, ``placed`` how that was found out, None of the first frame.
-    ``step`` is the motion (last frame from next, a similarity) in ``step_s`` seconds, None if it is
+    ``step`` is the motion (last frame from next) in ``step_s`` seconds, None if it is
     not known.
     """
 
